@@ -120,7 +120,7 @@ class AutogradShot:
     @property
     def inputs(self) -> Mapping[str, Tensor] | None:
         """The rasterizer's inputs, if they are known."""
-        return self.drawn if self.drawing is None else self.drawing.inputs
+        return self.drawn if self.drawing is None else self.drawing.inputs.attributes()
 
     @property
     def edges(self) -> Mapping[str, Edge] | None:
@@ -186,7 +186,8 @@ class AutogradShot:
 
     def _of_detail(self, rgb: Float[Tensor, "N 3"], basis: Float[Tensor, "N B1"]) -> Float[Tensor, "N 3"]:
         """The gradient of f_det from that of the drawn colours: it is their offset, or both are computed from it."""
-        detail, colors, offset = self.params.get("detail"), self.drawing.inputs["colors"], self.drawing.offset  # type: ignore[union-attr]
+        detail, inputs = self.params.get("detail"), self.drawing.inputs  # type: ignore[union-attr]
+        colors, offset = inputs.colors, inputs.rgb_offset
         if detail is None or (offset is detail and not graph_of(colors).reaches([detail])):
             return rgb
         ways = [(edge_of(x), bands) for x, bands in joined(colors) if graph_of(x).reaches([detail])]

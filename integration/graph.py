@@ -13,7 +13,7 @@ from torch.autograd.graph import GradientEdge, get_gradient_edge
 
 from clear_strategies.errors import HostError
 from integration.structure import rows_drawn
-from rasterizers.differentiable import Rendered
+from rasterizers.differentiable import Drawing
 from rasterizers.torch_internals import hooks_on_gradient, is_cat, leaf_of, of_gradient
 
 _GOLDEN: Final = 0.6180339887498949  # its multiples modulo 1 differ most for neighbouring rows
@@ -34,7 +34,7 @@ class Graph(NamedTuple):
 
     nodes: set[Any]
     leaves: list[Tensor]
-    drawn: list[Rendered]
+    drawn: list[Drawing]
 
     def reaches(self, leaves: Iterable[Tensor]) -> bool:
         """Whether one of these is among its leaves."""
@@ -48,8 +48,8 @@ def graph_of(*edges: Edge) -> Graph:
         graph.nodes.add(node)
         if (leaf := leaf_of(node)) is not None:
             graph.leaves.append(leaf)
-        elif isinstance(drawn := getattr(node, "rendered", None), Rendered):
-            graph.drawn.append(drawn)
+        elif isinstance(drawing := getattr(node, "drawing", None), Drawing):
+            graph.drawn.append(drawing)
     return graph
 
 

@@ -40,7 +40,7 @@ from integration.autograd_shot import (
 )
 from integration.host import Host
 from integration.views import enlarged_mask
-from rasterizers.differentiable import BackwardHook, Drawing
+from rasterizers.differentiable import Drawing
 from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, can_be_recorded, over
 from rasterizers.modes import in_full_precision
@@ -120,7 +120,8 @@ class _RenderInputs(NamedTuple):
             rasterizer = over(rasterizer, (red, green, blue))
         drawn = Inputs(self.means, self.quats, self.scales, self.opacities, self.colors, self.rgb_offset)
         r = rasterizer(drawn.splats(), self.camera)
-        drawing = Drawing(r, asked.inputs, r.image, BackwardHook(), asked.offset)
+        inputs = Inputs(**asked.inputs, rgb_offset=asked.offset)
+        drawing = Drawing(r, rasterizer, asked.camera, inputs, asked.bands)
         image = r.image if self.mask is None else r.image * self.mask
         return AutogradShot(image, r.means2d, r.visible, asked.params, drawings=(drawing,), mask=self.mask)
 

@@ -196,7 +196,7 @@ class Pending:
         drawing = None if self.output is None else self.output.shot.drawing
         if drawing is None or not self.merged.isdisjoint(("sh0", "shN")):
             return False
-        return are_joined(drawing.inputs["colors"], params) and are_accumulated(params)
+        return are_joined(drawing.inputs.colors, params) and are_accumulated(params)
 
     def routed_of(self, names: Iterable[str], params: Mapping[str, Tensor]) -> Grads:
         """g^HR of these parameters only, and the gradient of f_det."""
@@ -253,7 +253,7 @@ def why_nothing_was_merged(pending: Pending | None, trained: Sequence[str]) -> t
             "step of its own, e.g. of the depth, belongs into the sum with that of the photo.",
         )
     drawings, names = pending.output.shot.drawings, ", ".join(trained)
-    if not pending.output.marks and not any(x.requires_grad for d in drawings for x in d.inputs.values()):
+    if not pending.output.marks and not any(x.requires_grad for d in drawings for x in d.inputs.attributes().values()):
         return (
             f"the rendering of {pending.view} does not depend on {names}",
             "Pass the function tensors that are made of the parameters, with gradients enabled and not detached.",

@@ -57,12 +57,12 @@ def drawing_ahead(viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width:
         _ahead.wanted = _ahead.kept = None
 
 
-def is_drawing_ahead() -> bool:
+def is_active() -> bool:
     """Whether an image is to be drawn ahead, or has been and is not yet asked for."""
     return _ahead.wanted is not None or _ahead.kept is not None
 
 
-def draw_or_take(rasterizer: Rasterizer, splats: Splats, camera: Camera, *, depth: bool) -> Rendering:
+def draw(rasterizer: Rasterizer, splats: Splats, camera: Camera, *, depth: bool) -> Rendering:
     """The image, drawn now or ahead."""
     if _ahead.kept is not None and _ahead.kept[0] == _shown(rasterizer, splats, camera, depth):
         rendering, _ahead.kept = _ahead.kept[1], None

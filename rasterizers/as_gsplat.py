@@ -145,8 +145,8 @@ def _drawn(
         learns: whether a backward pass may follow, and `means2d` is to have a gradient.
     """
     drawn = [view.parts() for view in views]
-    each = [parts[0].rendered for parts in drawn]  # the parts of a picture have the same centres
-    visible = [rendered.rendering.visible.nonzero()[:, 0] for rendered in each] if packed else []
+    each = [parts[0].drawing for parts in drawn]  # the parts of a picture have the same centres
+    visible = [drawing.rendering.visible.nonzero()[:, 0] for drawing in each] if packed else []
     info = info_of_visible(each, lead[-1], visible) if packed else info_of_all(each, lead)
     means2d, every = info["means2d"].requires_grad_(learns), [None] * len(views)
     sizes = [len(i) for i in visible] or [len(view.inputs.means) for view in views]

@@ -50,9 +50,9 @@ def draw(
     if colors is None:
         colors = torch.cat((splats.sh0, splats.shN), 1)
     inputs = Inputs(splats.means, splats.quats, splats.scales, splats.opacities, colors, splats.rgb_offset)
-    rendered = render(rasterizer, inputs, 1 + splats.shN.shape[1], camera, depth=depth)
+    drawing = render(rasterizer, inputs, 1 + splats.shN.shape[1], camera, depth=depth)
     if means2d is None:
-        means2d = rendered.rendering.means2d.clone().requires_grad_()
+        means2d = drawing.rendering.means2d.clone().requires_grad_()
     else:
-        means2d.data.copy_(rendered.rendering.means2d)
-    return in_graph(rendered, means2d, pose=camera.world_to_camera)
+        means2d.data.copy_(drawing.rendering.means2d)
+    return in_graph(drawing, means2d, pose=camera.world_to_camera)

@@ -6,10 +6,10 @@ A backward pass handles one cotangent, `Rendering.vjp` several; `collected_drawi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple, cast
 
 import torch
@@ -17,8 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rasterizers import replayed_drawing
-from rasterizers.ahead import draw_or_take, is_drawing_ahead
+from rasterizers import ahead, replayed_drawing
 from rasterizers.checks import require_trait
 from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, over
@@ -63,20 +62,32 @@ class BackwardHook:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawing:
-    """A drawing with gradients.
+    """A rendering, and what it shows.
 
     Args:
-        inputs: means, quats, scales, opacities and colors [N, K, 3], the arguments of `draw` in the autograd graph.
-        image: as `draw` returned it, in the autograd graph.
+        inputs: the arguments of `draw`, in the autograd graph.
+        bands: the number of bands of their colours that are drawn.
         hook: called by backward passes that reach the drawing.
-        offset: of the colours, in the graph.
+        output: the image in the graph, see `in_graph`.
     """
 
     rendering: Rendering
-    inputs: Mapping[str, Tensor]
-    image: Float[Tensor, "H W 3"]
-    hook: BackwardHook
-    offset: Float[Tensor, "N 3"] | None = None
+    rasterizer: Rasterizer
+    camera: Camera
+    inputs: Inputs
+    bands: int
+    hook: BackwardHook = field(default_factory=BackwardHook)
+    output: Float[Tensor, "H W 3"] | None = None
+
+    @property
+    def image(self) -> Float[Tensor, "H W 3"]:
+        """In the graph, or the rendering's."""
+        return self.rendering.image if self.output is None else self.output
+
+    @property
+    def splats(self) -> Splats:
+        """What is drawn, outside of any graph."""
+        return self.inputs.splats(self.bands)
 
 
 _collecting: Final = ContextVar[tuple[list[Drawing], ...]]("collecting", default=())
@@ -96,24 +107,9 @@ def collected_drawings() -> Iterator[list[Drawing]]:
         _collecting.reset(before)
 
 
-class Rendered(NamedTuple):
-    """A rendering, and what it shows: the inputs, and how many bands of their colours."""
-
-    rendering: Rendering
-    rasterizer: Rasterizer
-    camera: Camera
-    inputs: Inputs
-    bands: int
-
-    @property
-    def splats(self) -> Splats:
-        """What is drawn, outside of any graph."""
-        return self.inputs.splats(self.bands)
-
-
 def render(
     rasterizer: Rasterizer, inputs: Inputs, bands: int, camera: Camera, *, depth: bool, replays: bool = False
-) -> Rendered:
+) -> Drawing:
     """Draw without autograd; `in_graph` makes the result differentiable.
 
     Args:
@@ -127,50 +123,48 @@ def render(
     if depth:
         require_trait(rasterizer, "depth")
     with torch.no_grad():
-        if replays and not is_drawing_ahead():
+        if replays and not ahead.is_active():
             rendering = replayed_drawing.draw(rasterizer, inputs.drawn(bands), camera, depth=depth)
         else:
-            rendering = draw_or_take(rasterizer, inputs.splats(bands), camera, depth=depth)
-    return Rendered(rendering, rasterizer, camera, inputs, bands)
+            rendering = ahead.draw(rasterizer, inputs.splats(bands), camera, depth=depth)
+    return Drawing(rendering, rasterizer, camera, inputs, bands)
 
 
 def in_graph(
-    rendered: Rendered,
+    drawing: Drawing,
     means2d: Float[Tensor, "M 2"],
     rows: Int[Tensor, " M"] | None = None,
     *,
     pose: Float[Tensor, "4 4"] | None = None,
     absgrad: Float[Tensor, "M 2"] | None = None,
 ) -> Drawn:
-    """The rendering as a differentiable function of its inputs, the projected centres and the pose.
+    """The drawing as a differentiable function of its inputs, the projected centres and the pose.
 
     Args:
         rows: the Gaussians whose centres `means2d` holds; None: all.
         absgrad: each backward pass adds Σ|∂L/∂u| over the pixels, of these rows.
     """
-    hook, inputs = BackwardHook(), rendered.inputs
     if absgrad is not None:
-        require_trait(rendered.rasterizer, "absgrad")
+        require_trait(drawing.rasterizer, "absgrad")
     image, alpha, visible, depth = _Draw.apply(  # type: ignore[no-untyped-call]
-        rendered, rows, hook, absgrad, pose, means2d, *inputs
+        drawing, rows, absgrad, pose, means2d, *drawing.inputs
     )
     for drawings in _collecting.get() if image.grad_fn is not None else ():
-        drawn = {name: x for name, x in inputs._asdict().items() if name != "rgb_offset"}
-        drawings.append(Drawing(rendered.rendering, drawn, image, hook, inputs.rgb_offset))
+        drawings.append(replace(drawing, output=image))
     return Drawn(image, alpha, means2d, visible, depth)
 
 
-_POSE: Final = 4  # among the arguments of `_Draw.forward`
-_COLORS: Final = 6 + Inputs._fields.index("colors")
+_POSE: Final = 3  # among the arguments of `_Draw.forward`
+_COLORS: Final = 5 + Inputs._fields.index("colors")
 
 
 class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, rendered: Rendered, rows: Tensor | None, hook: BackwardHook, absgrad: Tensor | None, pose: Tensor | None,
-        means2d: Tensor, *inputs: Tensor | None
+        ctx: Any, drawing: Drawing, rows: Tensor | None, absgrad: Tensor | None, pose: Tensor | None, means2d: Tensor,
+        *inputs: Tensor | None
     ) -> Any:  # fmt: skip
-        ctx.rendered, ctx.rows, ctx.hook, ctx.absgrad, rendering = rendered, rows, hook, absgrad, rendered.rendering
+        ctx.drawing, ctx.rows, ctx.absgrad, rendering = drawing, rows, absgrad, drawing.rendering
         ctx.pose = None if pose is None else (pose.device, pose.dtype)
         ctx.mark_non_differentiable(visible := rendering.visible.data)
         ctx.set_materialize_grads(False)
@@ -184,7 +178,8 @@ class _Draw(torch.autograd.Function):
     @in_full_precision
     @once_differentiable  # a second derivative would silently be 0
     def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None, _: None, d_depth: Tensor | None) -> Any:
-        rendering, rasterizer, camera, inputs, _ = ctx.rendered
+        drawing = ctx.drawing
+        rendering, rasterizer, camera, inputs = drawing.rendering, drawing.rasterizer, drawing.camera, drawing.inputs
         layers: dict[str, Any] = {"alpha": d_alpha, "depth": d_depth}
         layers = {name: d[None] for name, d in layers.items() if d is not None and bool(d.any())}
         takes_layers = rasterizer.traits.depth_gradient
@@ -193,7 +188,7 @@ class _Draw(torch.autograd.Function):
                 f"the loss depends on a rendered depth, which has no gradient in {type(rasterizer).__name__} (its "
                 "traits.depth_gradient is False); detach it, draw with cpp or torch, or let rasterizers.rasterization draw it."
             )
-        take_colours = ctx.hook.reached()
+        take_colours = drawing.hook.reached()
         ctx.saved_tensors  # noqa: B018 - raises if one was changed in place since it was drawn
         if d_image is None:
             d_image = torch.zeros_like(rendering.image)
@@ -205,7 +200,7 @@ class _Draw(torch.autograd.Function):
             other = (0.0 if b[0] > 0.5 else 1.0, *b[1:])
             d_red = torch.zeros_like(d_image)
             d_red[..., 0] = layers["alpha"][0] / (other[0] - b[0])
-            over_other = over(rasterizer, other)(ctx.rendered.splats, camera)
+            over_other = over(rasterizer, other)(drawing.splats, camera)
             drawn, more = [(rendering, d_image + d_red), (over_other, -d_red)], {}
         if ctx.absgrad is not None:
             more = more | {"absgrad": True}
@@ -226,9 +221,9 @@ class _Draw(torch.autograd.Function):
         if ctx.needs_input_grad[_POSE]:
             means, quats, scales, opacities = (x[None] for x in geometry)
             g = SplatGradients(means, quats, scales, opacities, screen[None], rgb[None], basis)
-            pose = pose_gradient(ctx.rendered.splats, camera, g).to(*ctx.pose)
+            pose = pose_gradient(drawing.splats, camera, g).to(*ctx.pose)
         screen = screen if ctx.rows is None else screen[ctx.rows]
-        return None, None, None, None, pose, screen, *geometry, colors, None if inputs.rgb_offset is None else rgb
+        return None, None, None, pose, screen, *geometry, colors, None if inputs.rgb_offset is None else rgb
 
 
 def outer(rgb: Float[Tensor, "N 3"], basis: Float[Tensor, "N B1"], bands: int) -> Float[Tensor, "N K 3"]:

@@ -9,19 +9,19 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from rasterizers.differentiable import Rendered, stacked
+from rasterizers.differentiable import Drawing, stacked
 from rasterizers.interface import RasterSettings, WithTraits
 from rasterizers.modes import in_full_precision
 from rasterizers.reference.projection import footprints
 
 
-def info_of_all(each: Sequence[Rendered], lead: tuple[int, ...]) -> dict[str, Any]:
+def info_of_all(each: Sequence[Drawing], lead: tuple[int, ...]) -> dict[str, Any]:
     """What gsplat's strategies read of these images.
 
     Args:
         lead: the dimensions of scenes and cameras, which `each` goes through.
     """
-    renderings = [rendered.rendering for rendered in each]
+    renderings = [drawing.rendering for drawing in each]
     means2d = stacked([rendering.means2d for rendering in renderings])
     means2d = means2d.clone() if len(each) == 1 else means2d
 
@@ -31,11 +31,11 @@ def info_of_all(each: Sequence[Rendered], lead: tuple[int, ...]) -> dict[str, An
 
     def ellipses() -> dict[str, Tensor]:
         found: dict[str, list[Tensor]] = {name: [] for name in of_ellipses}
-        for rendered in each:
-            rows = rendered.rendering.visible.nonzero()[:, 0]
-            columns = _columns(rendered, rows)
+        for drawing in each:
+            rows = drawing.rendering.visible.nonzero()[:, 0]
+            columns = _columns(drawing, rows)
             for name, wholes in found.items():
-                whole = columns[name].new_zeros(len(rendered.inputs.means), *columns[name].shape[1:])
+                whole = columns[name].new_zeros(len(drawing.inputs.means), *columns[name].shape[1:])
                 wholes.append(whole.index_copy(0, rows, columns[name]))
         return {name: torch.stack(x).view(*lead, *x[0].shape) for name, x in found.items()}
 
@@ -45,13 +45,13 @@ def info_of_all(each: Sequence[Rendered], lead: tuple[int, ...]) -> dict[str, An
         "camera_ids": None,
         "batch_ids": None,
     }
-    own_radii = all(rendered.rasterizer.traits.radii for rendered in each)
+    own_radii = all(drawing.rasterizer.traits.radii for drawing in each)
     of_ellipses = ("depths", "conics", "opacities", *(() if own_radii else ("radii",)))
     later = {"radii": radii, **dict.fromkeys(of_ellipses, ellipses)}
     return _Info(values, later)
 
 
-def info_of_visible(each: Sequence[Rendered], cameras: int, rows: Sequence[Int[Tensor, " _"]]) -> dict[str, Any]:
+def info_of_visible(each: Sequence[Drawing], cameras: int, rows: Sequence[Int[Tensor, " _"]]) -> dict[str, Any]:
     """The same of the visible alone, which are these rows of each image."""
     columns = [_columns(*one) for one in zip(each, rows, strict=True)]
     info: dict[str, Any] = {name: torch.cat([x[name] for x in columns]) for name in columns[0]}
@@ -60,13 +60,13 @@ def info_of_visible(each: Sequence[Rendered], cameras: int, rows: Sequence[Int[T
 
 
 @in_full_precision
-def _columns(rendered: Rendered, rows: Int[Tensor, " M"]) -> dict[str, Tensor]:
+def _columns(drawing: Drawing, rows: Int[Tensor, " M"]) -> dict[str, Tensor]:
     """The columns of gsplat's `info` for the visible Gaussians."""
-    splats, settings = rendered.inputs, cast(RasterSettings, rendered.rasterizer)  # `over` has checked it
-    f = footprints(splats.means[rows], splats.quats[rows], splats.scales[rows], rendered.camera, settings.kernel)
+    splats, settings = drawing.inputs, cast(RasterSettings, drawing.rasterizer)  # `over` has checked it
+    f = footprints(splats.means[rows], splats.quats[rows], splats.scales[rows], drawing.camera, settings.kernel)
     opacities = splats.opacities[rows] * f.compensation if settings.antialiased else splats.opacities[rows]
     radii = f.radii(opacities, settings.alpha_min).int()
-    means2d = rendered.rendering.means2d[rows]
+    means2d = drawing.rendering.means2d[rows]
     return {"means2d": means2d, "radii": radii, "depths": f.depths, "conics": f.conics, "opacities": opacities}
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from rasterizers.differentiable import Rendered, in_graph, render
+from rasterizers.differentiable import Drawing, in_graph, render
 from rasterizers.geometry import constant_band, depths, low_and_span
 from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, over
@@ -30,7 +30,7 @@ class Part:
         keeps: how many of the three are wanted.
     """
 
-    rendered: Rendered
+    drawing: Drawing
     low: float = 0.0
     span: float = 1.0
     keeps: int = 3
@@ -83,7 +83,7 @@ class CameraView:
         self, parts: Sequence[Part], means2d: Tensor, rows: Int[Tensor, " M"] | None, absgrad: Tensor | None
     ) -> tuple[Float[Tensor, "H W X"], Float[Tensor, "H W"]]:
         """The picture, and its alpha."""
-        drawn = [in_graph(part.rendered, means2d, rows, pose=self.pose, absgrad=absgrad) for part in parts]
+        drawn = [in_graph(part.drawing, means2d, rows, pose=self.pose, absgrad=absgrad) for part in parts]
         pictures = [part.picture(one.image) for part, one in zip(parts, drawn, strict=True)]
         alpha, depth = drawn[0].alpha, drawn[0].depth
         if self.render_mode != "RGB":

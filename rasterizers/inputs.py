@@ -31,6 +31,10 @@ class Inputs(NamedTuple):
         means, quats, scales, opacities, colors, offset = (x if x is None else x.detach() for x in self)
         return Inputs(means, quats, scales, opacities, colors[:, :bands], offset)  # type: ignore[arg-type, index]
 
+    def attributes(self) -> dict[str, Tensor]:
+        """All but the offset, by name."""
+        return {name: x for name, x in self._asdict().items() if name != "rgb_offset"}
+
     def splats(self, bands: int | None = None) -> Splats:
         """`drawn`, as `Splats`."""
         means, quats, scales, opacities, colors, offset = self.drawn(bands)

@@ -172,7 +172,7 @@ class GaussianRasterizer(torch.nn.Module):
         pose = camera.world_to_camera
         view = CameraView(rasterizer, camera, pose, inputs, degree, s.bg.detach(), "RGB", replays=False)
         parts = view.parts()
-        drawn = parts[0].rendered.rendering
+        drawn = parts[0].drawing.rendering
         absgrad = None if s.kernel_size is None else torch.zeros_like(drawn.means2d)
         centres = drawn.means2d + _gradient_probe(means2D, camera, absgrad)
         image, alpha = view.picture(parts, centres, None, absgrad)
