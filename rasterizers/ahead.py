@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -68,14 +67,13 @@ def draw(rasterizer: Rasterizer, splats: Splats, camera: Camera, *, depth: bool)
         rendering, _ahead.kept = _ahead.kept[1], None
         return rendering
     wanted = _ahead.wanted
-    if wanted is None or camera.world_to_camera.tolist() != wanted.world_to_camera.tolist():
-        return with_depth(rasterizer, depth)(splats, camera)
-    _ahead.wanted = None
-    if splats.rgb_offset is None and _grid(camera) == _grid(wanted):  # this is the image itself
-        return with_depth(rasterizer, depth)(splats, camera)
-    plain = replace(splats, rgb_offset=None)
-    other = replace(wanted, world_to_camera=camera.world_to_camera)  # so that both share a tensor
-    together = functools.partial(rasterizer.render_scales, depth=[True] * 2) if depth else rasterizer.render_scales
-    ahead, rendering = together([(plain, other), (splats, camera)])
-    _ahead.kept = _shown(rasterizer, plain, other, depth), ahead, plain
-    return rendering
+    if wanted is not None and camera.world_to_camera.tolist() == wanted.world_to_camera.tolist():
+        _ahead.wanted = None
+        if splats.rgb_offset is not None or _grid(camera) != _grid(wanted):  # else this is the image itself
+            plain = replace(splats, rgb_offset=None)
+            other = replace(wanted, world_to_camera=camera.world_to_camera)  # so that both share a tensor
+            both = [(plain, other), (splats, camera)]
+            drawn, rendering = rasterizer.render_scales(both, **({"depth": [True] * 2} if depth else {}))
+            _ahead.kept = _shown(rasterizer, plain, other, depth), drawn, plain
+            return rendering
+    return with_depth(rasterizer, depth)(splats, camera)

@@ -1,8 +1,8 @@
 """Rasterizers as differentiable torch functions.
 
 `draw` returns a rendering that is part of the autograd graph; `as_gsplat.rasterization` does so with gsplat's signature. A
-backward pass handles one cotangent; `Rendering.vjp` handles several, and `collected_drawings` returns it to callers of code that
-draws.
+backward pass handles one cotangent; `Rendering.vjp` handles several, for which callers of code that draws have
+`collected_drawings`.
 """
 
 from __future__ import annotations

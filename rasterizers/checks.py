@@ -8,7 +8,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from rasterizers.interface import Rasterizer, Splats, Traits
+from rasterizers.interface import Splats, Traits
 
 _SHAPES: Final = {  # of a row; B is the number of higher bands
     "means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": ("B", 3), "rgb_offset": (3,),
@@ -67,16 +67,3 @@ def require_cotangents(cotangents: Tensor, image: Tensor) -> None:
     if cotangents.dim() != 4 or cotangents.shape[1:] != image.shape:
         height, width, _ = image.shape
         raise ValueError(f"cotangents must be [K, {height}, {width}, 3], got {tuple(cotangents.shape)}.")
-
-
-_WITH: Final = {
-    "depth": ("draws no depth", "cpp, torch, warp and gsplat do"),
-    "absgrad": ("has no absolute gradients", "cpp, torch and warp do"),
-}
-
-
-def require_trait(rasterizer: Rasterizer, name: str) -> None:
-    """Raise a ValueError for a rasterizer without the trait "depth" or "absgrad"."""
-    if not getattr(rasterizer.traits, name):
-        lacks, others = _WITH[name]
-        raise ValueError(f"{type(rasterizer).__name__} {lacks} (its traits.{name} is False); {others}.")

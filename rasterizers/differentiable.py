@@ -1,7 +1,5 @@
 """Renderings in the autograd graph of what they show: `autograd.draw` and `as_gsplat.rasterization` are made of `render`, which
 draws outside of it, and `in_graph`.
-
-A backward pass handles one cotangent, `Rendering.vjp` several; `collected_drawings` returns it to callers of code that draws.
 """
 
 from __future__ import annotations
@@ -18,7 +16,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rasterizers import ahead, replayed_drawing
-from rasterizers.checks import require_trait
 from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, over
 from rasterizers.modes import in_full_precision
@@ -81,7 +78,7 @@ class Drawing:
 
     @property
     def image(self) -> Float[Tensor, "H W 3"]:
-        """In the graph, or the rendering's."""
+        """The image in the graph; the rendering's where there is none."""
         return self.rendering.image if self.output is None else self.output
 
     @property
@@ -121,7 +118,7 @@ def render(
             "drawing at a time."
         )
     if depth:
-        require_trait(rasterizer, "depth")
+        _require_trait(rasterizer, "depth")
     with torch.no_grad():
         if replays and not ahead.is_active():
             rendering = replayed_drawing.draw(rasterizer, inputs.drawn(bands), camera, depth=depth)
@@ -145,13 +142,26 @@ def in_graph(
         absgrad: each backward pass adds Σ|∂L/∂u| over the pixels, of these rows.
     """
     if absgrad is not None:
-        require_trait(drawing.rasterizer, "absgrad")
+        _require_trait(drawing.rasterizer, "absgrad")
     image, alpha, visible, depth = _Draw.apply(  # type: ignore[no-untyped-call]
         drawing, rows, absgrad, pose, means2d, *drawing.inputs
     )
     for drawings in _collecting.get() if image.grad_fn is not None else ():
         drawings.append(replace(drawing, output=image))
     return Drawn(image, alpha, means2d, visible, depth)
+
+
+_WITH: Final = {
+    "depth": ("draws no depth", "cpp, torch, warp and gsplat do"),
+    "absgrad": ("has no absolute gradients", "cpp, torch and warp do"),
+}
+
+
+def _require_trait(rasterizer: Rasterizer, name: str) -> None:
+    """Raise a ValueError for a rasterizer without the trait "depth" or "absgrad"."""
+    if not getattr(rasterizer.traits, name):
+        lacks, others = _WITH[name]
+        raise ValueError(f"{type(rasterizer).__name__} {lacks} (its traits.{name} is False); {others}.")
 
 
 _POSE: Final = 3  # among the arguments of `_Draw.forward`

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from typing import Final
 
 import torch
@@ -48,19 +46,6 @@ def depths(means: Float[Tensor, "N 3"], pose: Float[Tensor, "4 4"]) -> Float[Ten
 def constant_band(rgb: Float[Tensor, "N 3"]) -> Float[Tensor, "N 1 3"]:
     """RGB as spherical harmonics."""
     return ((rgb - 0.5) / SH_C0)[:, None]
-
-
-def low_and_span(colors: Float[Tensor, "N 3"], background: Sequence[float]) -> tuple[float, float]:
-    """RGB in any range is drawn as (RGB - low) / span, with colours >= 0 over a background in [0, 1].
-
-    The weights of a pixel's colours and background sum to 1, so the image is low + span times what is drawn. A span below 1, a
-    power of two, keeps the digits of small colours: `constant_band` adds numbers near 1/2.
-    """
-    finite = colors.detach().nan_to_num(0, 0, 0)  # NaN is refused by the rasterizer
-    least, most = (float(x) for x in finite.aminmax()) if finite.numel() else (0.0, 0.0)
-    low = min(0.0, least, *background)
-    power = 2.0 ** max(math.frexp(max(most, *background) - low)[1], -126)
-    return low, max(min(1.0, power), max(background) - low)
 
 
 def spherical_harmonics(directions: Float[Tensor, "M 3"], bands: int) -> Float[Tensor, "M B1"]:

@@ -39,16 +39,11 @@ def info_of_all(each: Sequence[Drawing], lead: tuple[int, ...]) -> dict[str, Any
                 wholes.append(whole.index_copy(0, rows, columns[name]))
         return {name: torch.stack(x).view(*lead, *x[0].shape) for name, x in found.items()}
 
-    values = {
-        "means2d": means2d.view(*lead, *means2d.shape[1:]),
-        "gaussian_ids": None,
-        "camera_ids": None,
-        "batch_ids": None,
-    }
     own_radii = all(drawing.rasterizer.traits.radii for drawing in each)
     of_ellipses = ("depths", "conics", "opacities", *(() if own_radii else ("radii",)))
     later = {"radii": radii, **dict.fromkeys(of_ellipses, ellipses)}
-    return _Info(values, later)
+    of_packed = dict.fromkeys(("gaussian_ids", "camera_ids", "batch_ids"))
+    return _Info({"means2d": means2d.view(*lead, *means2d.shape[1:]), **of_packed}, later)
 
 
 def info_of_visible(each: Sequence[Drawing], cameras: int, rows: Sequence[Int[Tensor, " _"]]) -> dict[str, Any]:

@@ -7,6 +7,7 @@ and the 1 whose picture is alpha.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
@@ -17,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from rasterizers.differentiable import Drawing, in_graph, render
-from rasterizers.geometry import constant_band, depths, low_and_span
+from rasterizers.geometry import constant_band, depths
 from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, over
 
@@ -102,7 +103,7 @@ class CameraView:
         """Draw at most three channels, of any range, over black where `behind` gives no number."""
         keeps, behind = colors.shape[1], [*behind, *[0.0] * (3 - len(behind))]
         colors = pad(colors, (0, 3 - keeps))
-        low, span = low_and_span(colors, behind)
+        low, span = _low_and_span(colors, behind)
         inputs = self.inputs._replace(colors=constant_band((colors - low) / span), rgb_offset=None)
         part = self._drawn(inputs, 1, [(x - low) / span for x in behind], depth=depth)
         return replace(part, low=low, span=span, keeps=keeps)
@@ -110,3 +111,16 @@ class CameraView:
     def _drawn(self, inputs: Inputs, bands: int, behind: Sequence[float], *, depth: bool) -> Part:
         rasterizer = over(self.rasterizer, cast(Any, tuple(behind)))
         return Part(render(rasterizer, inputs, bands, self.camera, depth=depth, replays=self.replays))
+
+
+def _low_and_span(colors: Float[Tensor, "N 3"], background: Sequence[float]) -> tuple[float, float]:
+    """RGB in any range is drawn as (RGB - low) / span, with colours >= 0 over a background in [0, 1].
+
+    The weights of a pixel's colours and background sum to 1, so the image is low + span times what is drawn. A span below 1, a
+    power of two, keeps the digits of small colours: `constant_band` adds numbers near 1/2.
+    """
+    finite = colors.detach().nan_to_num(0, 0, 0)  # NaN is refused by the rasterizer
+    least, most = (float(x) for x in finite.aminmax()) if finite.numel() else (0.0, 0.0)
+    low = min(0.0, least, *background)
+    power = 2.0 ** max(math.frexp(max(most, *background) - low)[1], -126)
+    return low, max(min(1.0, power), max(background) - low)

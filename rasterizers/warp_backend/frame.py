@@ -43,8 +43,6 @@ _ELLIPSE: Final = ctypes.sizeof(cast(Any, types.Ellipse).ctype) // 4
 """Numbers of a `types.Ellipse`."""
 LANES: Final = 32
 """Threads per segment of the blending VJP, see `lanes_on`: a warp on CUDA."""
-TILE_LANES: Final = TILE**2
-"""Threads per tile of blending: a thread per pixel on CUDA."""
 
 
 class _View:
@@ -269,8 +267,8 @@ class WarpRendering:
             view.grid, frame.cuts, view.ellipses, frame.depths, lists.tiles, lists.gaussians, view.total, view.capacity, pieces,
             sums,
         )  # fmt: skip
-        kernel = blend_pieces(view.has_depth, lanes_on(frame.like.device, TILE_LANES))
-        launch(kernel, [segments], alone, block=TILE_LANES, together=True)
+        kernel = blend_pieces(view.has_depth, lanes_on(frame.like.device, types.PIXELS))  # on CUDA a thread per pixel
+        launch(kernel, [segments], alone, block=types.PIXELS, together=True)
         drawn = (
             view.grid, frame.cuts, frame.background, view.ellipses, frame.depths, lists.gaussians, lists.starts, lists.ends,
             pieces, sums, self._image, self._transmittance, self._ended, self._depth,
