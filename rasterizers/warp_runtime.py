@@ -125,7 +125,7 @@ class _Launch:
             params[0] = command.bounds
             if self.on_cuda:
                 command.params_addr[0] = ctypes.addressof(command.bounds)
-        for index, (argument, known) in enumerate(zip(arguments, self.arrays, strict=True), 1):
+        for index, (argument, kind, known) in enumerate(zip(arguments, self.kinds, self.arrays, strict=True), 1):
             if known is None and not isinstance(argument, ctypes.Structure):
                 params[index].value = argument
                 continue
@@ -135,18 +135,15 @@ class _Launch:
                 params[index] = _empty_array()
             else:
                 layout = argument.dtype, argument.shape, argument.stride()
-                described = params[index] = known.get(layout) or self._described(index, layout, argument)
+                if (described := known.get(layout)) is None:
+                    if len(known) >= _MOST_SHAPES:
+                        known.clear()
+                    described = known[layout] = array(argument, kind)
                 described.data = argument.data_ptr()
+                params[index] = described
             if self.on_cuda:
                 command.params_addr[index] = ctypes.addressof(params[index])
         return command
-
-    def _described(self, index: int, layout: Any, tensor: Tensor) -> Any:
-        known = self.arrays[index - 1]
-        if known is None or len(known) >= _MOST_SHAPES:
-            known = self.arrays[index - 1] = {}
-        known[layout] = array(tensor, self.kinds[index - 1])
-        return known[layout]
 
 
 class _Kept(threading.local):
