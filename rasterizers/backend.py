@@ -13,12 +13,14 @@ from rasterizers.interface import Camera, RasterSettings, Rendering, Splats
 
 
 class Backend(RasterSettings):
-    """A rasterizer, of `traits` and `draw`, which a subclass implements."""
+    """A rasterizer that is made of `traits` and `draw`, which a subclass implements."""
 
     __slots__ = ()
 
     def draw(self, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> list[Rendering]:
-        """Draw jobs with the same pose and tensor objects, which may share work; opacities and offsets may differ."""
+        """Draw each job, with depth or without. All have the same pose and the same tensors, so that they may share work;
+        opacities and offsets may differ.
+        """
         raise NotImplementedError
 
     def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> Rendering:
