@@ -93,6 +93,24 @@ def test_without_compiled_kernels_the_error_says_what_to_install():
         native.load_kernels("rasterizers.reference")
 
 
+def test_compiled_kernels_that_are_missing_are_looked_for_once(monkeypatch):
+    searched = []
+
+    def missing(name):
+        searched.append(name)
+        raise ImportError(name)
+
+    native._loaded.cache_clear()
+    monkeypatch.setattr(native.importlib, "import_module", missing)
+    try:
+        for _ in range(2):
+            assert native.empty_for(torch.zeros(2)).shape == (2,)
+            assert not strategies_native.available()
+    finally:
+        native._loaded.cache_clear()
+    assert searched == ["rasterizers.cpp._baseline", "clear_strategies.kernels._baseline"]
+
+
 @pytest.mark.parametrize("stated", ["of yesterday", None])
 def test_kernels_of_other_sources_are_refused_and_nothing_takes_their_place(stated, monkeypatch):
     """As after `git pull` without a new install, None before modules stated their sources."""
@@ -102,12 +120,12 @@ def test_kernels_of_other_sources_are_refused_and_nothing_takes_their_place(stat
             monkeypatch.delattr(module, "sources")
         else:
             monkeypatch.setattr(module, "sources", stated)
-    native.load_kernels.cache_clear()
+    native._loaded.cache_clear()
     for load in (cpp, strategies_native.available, rasterizers.fastest):
         with pytest.raises(OutdatedKernels, match=r"from other sources .* Install again: pip install") as refused:
             load()
         assert exit_codes.describe(refused.value) == (2, str(refused.value))
-    native.load_kernels.cache_clear()
+    native._loaded.cache_clear()
 
 
 def test_an_instruction_set_that_the_processor_lacks_is_refused(monkeypatch):
@@ -118,7 +136,7 @@ def test_an_instruction_set_that_the_processor_lacks_is_refused(monkeypatch):
     with pytest.raises(BackendUnavailable, match="isa=z80 cannot run here"):
         native.load_kernels("rasterizers.cpp", "z80")
     monkeypatch.setenv("CLEAR_ISA", "z80")
-    native.load_kernels.cache_clear()
+    native._loaded.cache_clear()
     with pytest.raises(BackendUnavailable, match="CLEAR_ISA=z80"):
         native.load_kernels("rasterizers.cpp")
-    native.load_kernels.cache_clear()
+    native._loaded.cache_clear()
