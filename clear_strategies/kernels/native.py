@@ -21,9 +21,13 @@ def fastest(device: torch.device) -> Literal["cpp", "warp", "torch"]:
     return "warp" if device.type == "cuda" and runs_warp("cuda") else "torch"
 
 
-def implementation(package: str, device: torch.device) -> ModuleType:
-    """The module of a package that computes float32 on this device: `cpp`, `warp`, or `reference` in torch."""
-    name = fastest(device)
+def implementation(package: str, *tensors: Tensor) -> ModuleType:
+    """The module of a package that computes these tensors: `cpp` or `warp` for float32 on one device, else `reference` in torch.
+    Tensors of whole numbers and masks among them may have any type.
+    """
+    device = tensors[0].device
+    alike = all(x.device == device and (x.dtype == torch.float32 or not x.is_floating_point()) for x in tensors)
+    name = fastest(device) if alike else "torch"
     return import_module(f"{package}.{'reference' if name == 'torch' else name}")
 
 

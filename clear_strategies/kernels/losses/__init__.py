@@ -8,8 +8,7 @@ images. A chosen implementation raises `TypeError` or `ValueError` for images th
 
 from __future__ import annotations
 
-import logging
-from functools import cache
+from importlib import import_module
 from types import ModuleType
 from typing import Final, Literal, get_args
 
@@ -18,21 +17,19 @@ from torch import Tensor
 
 from clear_strategies.errors import SettingError
 from clear_strategies.kernels import native
-from clear_strategies.kernels.losses import cpp, reference
+from clear_strategies.kernels.losses import reference
 from clear_strategies.kernels.losses.images import supported
 from clear_strategies.kernels.losses.reference import LossAndGradient
 from rasterizers.warp_runtime import require_warp
 
 __all__ = ["Choice", "LossAndGradient", "haar_l1", "photometric", "require", "ssim"]
 
-_log = logging.getLogger(__name__)
-
 Choice = Literal["auto", "torch", "cpp", "warp"]
 _CHOICES: Final = get_args(Choice)
 
 
-def require(kernels: Choice) -> None:
-    """Check that an implementation can run, before the first image.
+def require(kernels: Choice, device: str = "cpu") -> None:
+    """Check that an implementation can run on "cpu" or "cuda", before the first image.
 
     Raises:
         SettingError: there is no such implementation.
@@ -43,7 +40,7 @@ def require(kernels: Choice) -> None:
     if kernels == "cpp":
         native.module()
     if kernels == "warp":
-        _warp("cpu")
+        require_warp("kernels=warp", device, "kernels=torch runs here")
 
 
 def photometric(
@@ -70,7 +67,8 @@ def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], inset: int = 0) -
     Raises:
         ValueError: there is no such pixel.
     """
-    return cpp.ssim(x, y, inset) if _fastest(x, y) == "cpp" else reference.ssim(x, y, inset)
+    loss: LossAndGradient = getattr(_chosen("auto", x, y), "ssim", reference.ssim)(x, y, inset)
+    return loss
 
 
 def haar_l1(
@@ -90,25 +88,7 @@ def haar_l1(
 
 def _chosen(kernels: Choice, x: Tensor, y: Tensor) -> ModuleType:
     """The implementation, a module with the functions of `reference`."""
-    require(kernels)
     if kernels == "auto":
-        kernels = _fastest(x, y)
-    _log_once(f"cpp, for {native.module().isa}" if kernels == "cpp" else kernels)
-    return _warp(x.device.type) if kernels == "warp" else cpp if kernels == "cpp" else reference
-
-
-def _fastest(x: Tensor, y: Tensor) -> Choice:
-    return native.fastest(x.device) if supported(x, y) else "torch"
-
-
-@cache
-def _warp(device: str) -> ModuleType:
-    require_warp("kernels=warp", device, "kernels=torch runs here")
-    from clear_strategies.kernels.losses import warp
-
-    return warp
-
-
-@cache
-def _log_once(which: str) -> None:
-    _log.debug("image losses: %s.", which)
+        return native.implementation(__name__, x, y) if supported(x, y) else reference
+    require(kernels, x.device.type)
+    return import_module(f"{__name__}.{'reference' if kernels == 'torch' else kernels}")

@@ -14,14 +14,9 @@ _IN_WORDS: Final = {"cpu": "the CPU", "cuda": "CUDA"}
 
 
 def supported(*images: Tensor) -> bool:
-    """Return True if compiled losses support the type and shape of these images on one device."""
+    """Return True for floating-point images [H, W, 3] with pixels; compiled losses support no others."""
     return all(
-        image.dtype == torch.float32
-        and image.device == images[0].device
-        and image.ndim == 3
-        and image.shape[2] == 3
-        and image.numel() > 0
-        for image in images
+        image.is_floating_point() and image.ndim == 3 and image.shape[2] == 3 and image.numel() for image in images
     )
 
 

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import wraps
-from types import ModuleType
 from typing import ParamSpec, TypeVar
 
-import torch
 from torch import Tensor
 
 from clear_strategies.core.evidence import Evidence
@@ -28,7 +26,10 @@ def _fastest(function: Callable[P, T]) -> Callable[P, T]:
 
     @wraps(function)
     def chosen(*args: P.args, **kwargs: P.kwargs) -> T:
-        kernels = _kernels([x for arg in args for x in _tensors(arg)])
+        tensors = [x for arg in args for x in _tensors(arg)]
+        kernels = native.implementation(__name__, *tensors)
+        if kernels is cpp and not all(x.is_contiguous() for x in tensors):
+            return function(*args, **kwargs)
         fastest: Callable[P, T] = getattr(kernels, function.__name__, function)
         return fastest(*args, **kwargs)
 
@@ -39,15 +40,6 @@ def _tensors(argument: object) -> Sequence[Tensor]:
     if isinstance(argument, Evidence):  # a strategy's, of any type
         return argument.reliability, argument.demand
     return [argument] if isinstance(argument, Tensor) else []
-
-
-def _kernels(tensors: Sequence[Tensor]) -> ModuleType | None:
-    """The implementation for float32 on one device, contiguous where that is C++; None: torch."""
-    device = tensors[0].device
-    if any(x.device != device or (x.is_floating_point() and x.dtype != torch.float32) for x in tensors):
-        return None
-    kernels = native.implementation(__name__, device)
-    return None if kernels is cpp and not all(x.is_contiguous() for x in tensors) else kernels
 
 
 accumulate = _fastest(reference.accumulate)

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import ModuleType
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -73,7 +72,5 @@ def dense(g: Grads, like: Mapping[str, Tensor]) -> Grads:
 
 
 def _chosen(*tensors: Tensor) -> ModuleType:
-    first = tensors[0]
-    if any(x.dtype != torch.float32 or x.device != first.device or x.shape[1:].numel() > WIDEST for x in tensors):
-        return reference
-    return native.implementation(__name__, first.device)
+    is_wide = any(x.shape[1:].numel() > WIDEST for x in tensors)
+    return reference if is_wide else native.implementation(__name__, *tensors)
