@@ -10,7 +10,7 @@ that cannot be replayed. A replay has the bits of a live iteration.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, wraps
 from typing import Any, TypeVar, cast
@@ -20,8 +20,10 @@ from torch import Tensor
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.kernels import native
+from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Update
 from clear_strategies.merging.recorded_work import RecordedWork, merging_strategies, replays_on, why_not_recorded
+from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Color, Rasterizer, Recordable, can_be_recorded, over
@@ -50,15 +52,32 @@ class ViewInputs:
     background: Color | None
     looked_up: Tensor | None = None
 
-    @property
-    def photos(self) -> Sequence[Photo]:
-        """The photos that the iteration compares renderings with: LR, and HR where it is drawn."""
-        return [self.view.lr, self.view.hr] if self.scales["hr"] else [self.view.lr]
+    def given(self, conductor: Conductor) -> Given:
+        """What a replay reads in place of this iteration's own, apart from the background."""
+        photos = [self.view.lr, self.view.hr] if self.scales["hr"] else [self.view.lr]
+        return self.gate, conductor.looked_up(self.view), *(x for photo in photos for x in _given(photo, self))
+
+    def reading(self, given: Sequence[Any]) -> ViewInputs:
+        """The same inputs with what is given in their place."""
+        gate, looked_up, *photos = given
+        lr = _reading(self.view.lr, photos[:3])
+        hr = _reading(self.view.hr, photos[3:]) if photos[3:] else self.view.hr  # without HR, only its size is read
+        return replace(self, view=replace(self.view, lr=lr, hr=hr), gate=gate, background=None, looked_up=looked_up)
+
+    def constants(self, s: TrainState) -> Sequence[Any]:
+        """What Python decides by, apart from the shapes of what is given."""
+        v = self.view
+        layers = v.depth, v.disagreement, v.truth, v.lr.transparency, v.hr.transparency if self.scales["hr"] else None
+        return [*self.scales.values(), s.density.collects(self.t), *(x is None for x in layers)]
+
+    def calls(self, conductor: Conductor) -> Iterable[Strategy]:
+        """The strategies that a recording depends on by what they store."""
+        return *merging_strategies(conductor), *conductor.comparing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExtraViewInputs:
-    """The inputs of an iteration's step on an extra view.
+    """The inputs of an iteration's step on an extra view; methods as of `ViewInputs`.
 
     Args:
         t, background: see `ViewInputs`.
@@ -68,14 +87,34 @@ class ExtraViewInputs:
     view: ExtraView
     background: Color | None
 
-    @property
-    def photos(self) -> Sequence[Photo]:
-        """See `ViewInputs`."""
-        return [self.view.photo]
+    def given(self, conductor: Conductor) -> Given:
+        return self.view.weight, *_given(self.view.photo, self)
+
+    def reading(self, given: Sequence[Any]) -> ExtraViewInputs:
+        weight, *photo = given
+        view = replace(self.view, photo=_reading(self.view.photo, photo), weight=weight)
+        return replace(self, view=view, background=None)
+
+    def constants(self, s: TrainState) -> Sequence[Any]:
+        return self.view.robust, self.view.photo.transparency is None
+
+    def calls(self, conductor: Conductor) -> Iterable[Strategy]:
+        return ()
 
 
-IterationInputs = ViewInputs | ExtraViewInputs
 Inputs = TypeVar("Inputs", ViewInputs, ExtraViewInputs)
+
+
+def _given(photo: Photo, inputs: ViewInputs | ExtraViewInputs) -> Given:
+    """The photo over the background of the iteration, in parts."""
+    photo = photo.over(inputs.background, inputs.view.background)
+    return photo.camera, photo.image, photo.shown
+
+
+def _reading(photo: Photo, given: Sequence[Any]) -> Photo:
+    """The photo that is given in place of this one."""
+    camera, image, shown = given
+    return Photo(camera, image, shown, photo.transparency)
 
 
 def replays_for(s: TrainState, rasterizer: Rasterizer) -> Replays | None:
@@ -96,39 +135,32 @@ def replayable(learn: Callable[[TrainState, Rasterizer, Inputs], L]) -> Callable
     def learned(s: TrainState, rasterizer: Rasterizer, inputs: Inputs) -> L:
         if s.replays is None:
             return learn(s, rasterizer, inputs)
-        return _replayed(s, s.replays, rasterizer, inputs, learn)
+        steps, drawn_by = s.optimizer.steps, cast(Recordable, rasterizer)
+        background = cast(Recordable, over(rasterizer, inputs.background)).background_on(s.device)
+        given = background, *inputs.given(s.conductor)
+
+        def live() -> tuple[Update | None, dict[str, Number]]:
+            s.optimizer.steps = steps  # a failed recording or replay has counted one
+            return learn(s, rasterizer, inputs)
+
+        def recorded(copies: Sequence[Any]) -> L:
+            background, *others = copies
+            return learn(s, drawn_by.over_changing(background), inputs.reading(others))
+
+        def record() -> RecordedWork[Update | None]:
+            return RecordedWork(
+                s.device, s.conductor, recorded, given, inputs.t, calls=inputs.calls(s.conductor),
+                numbers_of=partial(drawn_by.numbers_of, device=s.device), count=cast(CompiledStep, s.compiled_step).count,
+            )  # fmt: skip
+
+        update, row = s.replays.do(_key(s, inputs, given), inputs.t, given, live=live, record=record)
+        if update is not None:
+            view: Any = inputs.view
+            # A strategy may store tensors of the step, which the next replay overwrites.
+            update = replace(update, step=replace(update.step.copied(), t=inputs.t, view=view))
+        return cast(L, (update, row))
 
     return learned
-
-
-def _replayed(
-    s: TrainState, replays: Replays, rasterizer: Rasterizer, inputs: IterationInputs,
-    learn: Callable[[TrainState, Rasterizer, Any], L],
-) -> L:  # fmt: skip
-    """The result of `learn`, run live, recorded, or replayed."""
-    steps, given, drawn_by = s.optimizer.steps, _given(s, rasterizer, inputs), cast(Recordable, rasterizer)
-
-    def live() -> tuple[Update | None, dict[str, Number]]:
-        s.optimizer.steps = steps  # a failed recording or replay has counted one
-        return learn(s, rasterizer, inputs)
-
-    def recorded(copies: list[Any]) -> L:
-        background, *rest = copies
-        return learn(s, drawn_by.over_changing(background), _reading(inputs, rest))
-
-    def record() -> RecordedWork[Update | None]:
-        merging, comparing = merging_strategies(s.conductor), s.conductor.comparing
-        return RecordedWork(
-            s.device, s.conductor, recorded, given, inputs.t, numbers_of=partial(drawn_by.numbers_of, device=s.device),
-            calls=(*merging, *comparing) if isinstance(inputs, ViewInputs) else (),
-            count=cast(CompiledStep, s.compiled_step).count,
-        )  # fmt: skip
-
-    update, row = replays.do(_key(s, inputs, given), inputs.t, given, live=live, record=record)
-    if isinstance(inputs, ViewInputs) and update is not None:
-        # A strategy may store tensors of the step, which the next replay overwrites.
-        update = replace(update, step=replace(update.step.copied(), t=inputs.t, view=inputs.view))
-    return cast(L, (update, row))
 
 
 def _why_not(s: TrainState, rasterizer: Rasterizer) -> Iterator[str]:
@@ -142,41 +174,12 @@ def _why_not(s: TrainState, rasterizer: Rasterizer) -> Iterator[str]:
     yield from why_not_recorded(s.conductor)
 
 
-def _key(s: TrainState, inputs: IterationInputs, given: Given) -> GraphKey:
+def _key(s: TrainState, inputs: ViewInputs | ExtraViewInputs, given: Given) -> GraphKey:
     λ = s.conductor.objective.lambda_hr(inputs.t)
     tables = s.field.raw(), s.optimizer.first, s.optimizer.second, s.conductor.state_dict()
     statistics = [x for x in s.density.state_dict().values() if x.dim() > 0]  # numbers are made for a checkpoint
     stored = [s.field.filter_3d, *statistics, *(x for table in tables for x in table.values())]
     addresses = [x.data_ptr() for x in stored]
     bands = max(cast(CompiledStep, s.compiled_step).bands, (s.field.degree + 1) ** 2 - 1)  # that the step will change
-    constants: list[Any] = [s.field.degree, bands, inputs.view.background, λ > 0]
-    if isinstance(inputs, ViewInputs):
-        constants += [*inputs.scales.values(), s.density.collects(inputs.t)]
-        constants += [x is None for x in (inputs.view.depth, inputs.view.disagreement, inputs.view.truth)]
-    else:
-        constants.append(inputs.view.robust)
-    constants += [photo.transparency is None for photo in inputs.photos]
-    return GraphKey(n := len(s.field), tuple(addresses), shapes_of(given, n), tuple(constants))
-
-
-def _given(s: TrainState, rasterizer: Rasterizer, inputs: IterationInputs) -> Given:
-    """What a replay reads in place of an iteration's own: the background, the gate or an extra view's weight, what is looked up,
-    and each photo over the background, with its camera.
-    """
-    background = cast(Recordable, over(rasterizer, inputs.background)).background_on(s.device)
-    each = [p.over(inputs.background, inputs.view.background) for p in inputs.photos]
-    photos = [x for p in each for x in (p.camera, p.image, p.shown)]
-    if isinstance(inputs, ExtraViewInputs):
-        return background, inputs.view.weight, None, *photos
-    return background, inputs.gate, s.conductor.looked_up(inputs.view), *photos
-
-
-def _reading(inputs: IterationInputs, given: list[Any]) -> IterationInputs:
-    """The inputs of an iteration that reads these, except for the background."""
-    gate, looked_up, *of_photos = given
-    each = zip(inputs.photos, of_photos[::3], of_photos[1::3], of_photos[2::3], strict=True)
-    photos = [Photo(camera, image, shown, p.transparency) for p, camera, image, shown in each]
-    if isinstance(inputs, ExtraViewInputs):
-        return replace(inputs, view=replace(inputs.view, photo=photos[0], weight=gate), background=None)
-    lr, hr = photos[0], photos[1] if inputs.scales["hr"] else inputs.view.hr  # without HR, only its size is read
-    return replace(inputs, view=replace(inputs.view, lr=lr, hr=hr), gate=gate, background=None, looked_up=looked_up)
+    constants = s.field.degree, bands, inputs.view.background, λ > 0, *inputs.constants(s)
+    return GraphKey(n := len(s.field), tuple(addresses), shapes_of(given, n), constants)
