@@ -19,7 +19,7 @@ from clear_strategies.core.step import Step
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
-from clear_strategies.merging.recorded_work import merging_strategies
+from clear_strategies.merging.replay import merging_strategies
 from integration.autograd_shot import AutogradShot, trained
 from integration.densification import ScoreScaler, score_for_host
 from integration.detail import Fading

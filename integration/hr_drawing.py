@@ -25,7 +25,7 @@ from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
-from clear_strategies.merging.recorded_work import RecordedWork, replays_on, why_not_recorded
+from clear_strategies.merging.replay import LoggedReplay, logged_replays, why_not_recordable
 from clear_strategies.strategies.base import stored
 from integration.announcement import Once
 from integration.autograd_shot import (
@@ -42,9 +42,9 @@ from integration.host import Host
 from integration.views import enlarged_mask
 from rasterizers.differentiable import Drawing
 from rasterizers.inputs import Inputs
-from rasterizers.interface import Camera, Rasterizer, can_be_recorded, over
+from rasterizers.interface import Camera, Rasterizer, is_recordable, over
 from rasterizers.modes import in_full_precision
-from rasterizers.replays import GraphKey, shapes_of
+from rasterizers.replays import ReplayKey, shapes_of
 from rasterizers.torch_internals import version
 
 _log = logging.getLogger(__name__)
@@ -113,7 +113,7 @@ class _RenderInputs(NamedTuple):
 
     def shot(self, asked: Drawable) -> AutogradShot:
         rasterizer = asked.rasterizer
-        if can_be_recorded(rasterizer):
+        if is_recordable(rasterizer):
             rasterizer = rasterizer.over_changing(self.background)
         else:
             red, green, blue = self.background[0].tolist()
@@ -149,8 +149,8 @@ class HrDrawing:
         self._loss_scale = host.loss_scale or (lambda: 1.0)
         self._log_once, self._warn_once = Once(_log.info), Once(_log.warning)
         self.is_scored = host.threshold is not None and conductor.owner("score") is not None
-        self.replays = replays_on(device, conductor, "the replay of HR")
-        if self.replays is not None and (reason := next(why_not_recorded(conductor), None)) is not None:
+        self.replays = logged_replays(device, conductor, "the replay of HR")
+        if self.replays is not None and (reason := next(why_not_recordable(conductor), None)) is not None:
             self.replays = None
             _log.info("HR is not replayed: %s.", reason)
 
@@ -244,15 +244,15 @@ class HrDrawing:
     def _done(self, asked: Drawable, inputs: _RenderInputs, t: int, constants: tuple[Any, ...], work: _Work) -> _Made:
         """Do the work, live or by a replay."""
         conductor, rasterizer = self._conductor, asked.rasterizer
-        if self.replays is None or not can_be_recorded(rasterizer):
+        if self.replays is None or not is_recordable(rasterizer):
             return work(inputs)
         called = *conductor.comparing, conductor.owner("observe"), conductor.owner("route")
         state = [x.data_ptr() for s in called if s is not None for x in stored(s)]
-        key = GraphKey(n := len(inputs.means), tuple(state), shapes_of(inputs, n), (rasterizer, *constants))
+        key = ReplayKey(n := len(inputs.means), tuple(state), shapes_of(inputs, n), (rasterizer, *constants))
         device = inputs.means.device
 
-        def record() -> RecordedWork[Any]:
-            return RecordedWork(
+        def record() -> LoggedReplay[Any]:
+            return LoggedReplay(
                 device, conductor, lambda copies: work(_RenderInputs(*copies)), inputs, t,
                 numbers_of=partial(rasterizer.numbers_of, device=device), calls=conductor.comparing,
             )  # fmt: skip

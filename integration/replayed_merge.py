@@ -21,11 +21,11 @@ from clear_strategies.core.gradients import Colour, Grads
 from clear_strategies.core.step import Step
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Merged
-from clear_strategies.merging.recorded_work import RecordedWork, merging_strategies, replays_on
+from clear_strategies.merging.replay import LoggedReplay, logged_replays, merging_strategies
 from clear_strategies.strategies.base import stored
 from rasterizers.guards import iteration, unread
 from rasterizers.recording import running
-from rasterizers.replays import GraphKey, shapes_of, write
+from rasterizers.replays import ReplayKey, shapes_of, write
 
 _FINITE: Final = "finite"
 """The key of `Merged.finite` among a merge's numbers; the others are conflict ratios."""
@@ -43,7 +43,7 @@ class ReplayedMerge:
 
     def __init__(self, conductor: Conductor, device: torch.device) -> None:
         self._conductor, self._device = conductor, device
-        self.replays = replays_on(device, conductor, "the replay of the merge")
+        self.replays = logged_replays(device, conductor, "the replay of the merge")
 
     def __call__(
         self, params: Mapping[str, Tensor], g_lr: Grads, g_hr: Grads, step: Step | None, t: int, out: Mapping[str, Tensor]
@@ -71,13 +71,13 @@ class ReplayedMerge:
             contiguous = torch.contiguous_format
             return work(copies, {name: torch.empty_like(x, memory_format=contiguous) for name, x in out.items()})
 
-        def record() -> RecordedWork[Mapping[str, Tensor]]:
-            return RecordedWork(self._device, conductor, recorded, inputs, t, calls=merging_strategies(conductor))
+        def record() -> LoggedReplay[Mapping[str, Tensor]]:
+            return LoggedReplay(self._device, conductor, recorded, inputs, t, calls=merging_strategies(conductor))
 
         called = conductor.owner("reconcile"), *conductor.regularizers
         saved = [x for s in called if s is not None for x in stored(s)]
         addresses = [x.data_ptr() for x in (*params.values(), *step.params.values(), *saved)]
-        key = GraphKey(n := len(first), tuple(addresses), shapes_of(inputs, n), (*of_lr, None, *of_hr, None, *out))
+        key = ReplayKey(n := len(first), tuple(addresses), shapes_of(inputs, n), (*of_lr, None, *of_hr, None, *out))
         made, row = self.replays.do(key, t, inputs, live=lambda: work(inputs, out), record=record)
         if made is not out:
             write([*out.values()], [*made.values()])

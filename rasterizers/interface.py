@@ -367,7 +367,7 @@ class Recordable(Rasterizer, Protocol):
         ...
 
 
-def can_be_recorded(rasterizer: Rasterizer) -> TypeGuard[Recordable]:
+def is_recordable(rasterizer: Rasterizer) -> TypeGuard[Recordable]:
     """Whether it is `Recordable`. `isinstance` with a protocol would take a tenth of the host's time in a replay."""
     return hasattr(rasterizer, "over_changing")
 

@@ -26,12 +26,12 @@ from rasterizers.interface import (
     Rendering,
     SplatGradients,
     WithTraits,
-    can_be_recorded,
+    is_recordable,
     over,
     with_depth,
 )
 from rasterizers.recording import Recording, on_side_stream, running
-from rasterizers.replays import Given, GraphKey, Recorded, Replays, StaticInputs, can_record, shapes_of, write
+from rasterizers.replays import Given, Replay, ReplayKey, Replays, StaticInputs, can_record, shapes_of, write
 
 _BLACK: Final = (0.0, 0.0, 0.0)
 _GRADIENTS: Final = tuple(f.name for f in fields(SplatGradients) if f.name != "absgrad")
@@ -40,7 +40,7 @@ _GRADIENTS: Final = tuple(f.name for f in fields(SplatGradients) if f.name != "a
 def draw(rasterizer: Rasterizer, inputs: Inputs, camera: Camera, *, depth: bool) -> Rendering:
     """Draw the inputs, which have no autograd graph, by a replay if one is possible."""
     device, call = inputs.means.device, _Call(rasterizer, inputs, camera, depth)
-    if not (can_record(device) and can_be_recorded(rasterizer)) or running() is not None:
+    if not (can_record(device) and is_recordable(rasterizer)) or running() is not None:
         return call.live()
     key, last = call.key, _thread.last
     if key in last and (drawn := last[key]()) is not None and drawn.awaits_backward:
@@ -48,9 +48,9 @@ def draw(rasterizer: Rasterizer, inputs: Inputs, camera: Camera, *, depth: bool)
     if device not in _thread.replays:
         _thread.replays[device] = Replays(device, "the replay of drawings")
     _thread.count += 1
-    record = partial(_RecordedDrawing, call)
+    record = partial(_DrawingReplay, call)
     rendering = _thread.replays[device].do(key, _thread.count, call.given, live=call.live, record=record)
-    if isinstance(rendering, _Replayed):
+    if isinstance(rendering, _ReplayedRendering):
         rendering.call = call
         _thread.last = {k: one for k, one in last.items() if one() is not None} | {key: weakref.ref(rendering)}
     return rendering
@@ -61,7 +61,7 @@ class _Thread(threading.local):
 
     def __init__(self) -> None:
         self.replays: dict[torch.device, Replays] = {}
-        self.last: dict[GraphKey, weakref.ref[_Replayed]] = {}
+        self.last: dict[ReplayKey, weakref.ref[_ReplayedRendering]] = {}
         self.count = 0
 
 
@@ -78,9 +78,9 @@ class _Call:
     depth: bool
 
     @property
-    def key(self) -> GraphKey:
+    def key(self) -> ReplayKey:
         n, device = len(self.inputs.means), self.inputs.means.device
-        return GraphKey(n, (), shapes_of(self.given, n), (device, _over_black(self.rasterizer), self.depth))
+        return ReplayKey(n, (), shapes_of(self.given, n), (device, _over_black(self.rasterizer), self.depth))
 
     @property
     def given(self) -> Given:
@@ -91,7 +91,7 @@ class _Call:
         return with_depth(self.rasterizer, self.depth)(self.inputs.splats(), self.camera)
 
 
-class _RecordedDrawing(Recorded[Rendering]):
+class _DrawingReplay(Replay[Rendering]):
     """Both passes of a drawing.
 
     Attributes:
@@ -125,7 +125,7 @@ class _RecordedDrawing(Recorded[Rendering]):
     def outcome(self) -> Rendering:
         self.replays += 1
         rendering, made = self._recording.result
-        return _Replayed(self, self.replays, rendering, _copied(made))
+        return _ReplayedRendering(self, self.replays, rendering, _copied(made))
 
     def vjp(self, cotangents: Float[Tensor, "1 H W 3"]) -> SplatGradients:
         """The gradients of the last replay."""
@@ -134,7 +134,7 @@ class _RecordedDrawing(Recorded[Rendering]):
         return SplatGradients(*_copied(self._backward.result))
 
 
-class _Replayed:
+class _ReplayedRendering:
     """The `Rendering` of a replay.
 
     Attributes:
@@ -143,15 +143,15 @@ class _Replayed:
 
     call: _Call
 
-    def __init__(self, of: _RecordedDrawing, number: int, last: Rendering, made: Sequence[Any]) -> None:
+    def __init__(self, of: _DrawingReplay, number: int, last: Rendering, made: Sequence[Any]) -> None:
         self.image, self.alpha, self.depth, self.means2d, self.visible = made
-        self._of, self._number, self._recorded = of, number, last
+        self._of, self._number, self._last = of, number, last
         self.awaits_backward = True
 
     @property
     def radii(self) -> Int[Tensor, "N 2"]:
         """See `WithTraits`."""
-        return cast(WithTraits, self._recorded if self._is_last else self.call.live()).radii
+        return cast(WithTraits, self._last if self._is_last else self.call.live()).radii
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"], **more: Any) -> SplatGradients:
         """See `WithTraits`."""

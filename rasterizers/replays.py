@@ -1,4 +1,4 @@
-"""Work on CUDA that is recorded and replayed, one recording for each `GraphKey`; see `rasterizers.recording`.
+"""Work on CUDA that is recorded and replayed, one recording for each `ReplayKey`; see `rasterizers.recording`.
 
 Work of a new kind runs live first, which compiles kernels and fills caches. The second time it is recorded, and from then on it
 is replayed, as long as the tensors that it reads stay at their addresses. When they move, it is recorded again. If a recording or
@@ -35,7 +35,7 @@ Given = Sequence[Tensor | Camera | None]
 
 
 @dataclass(frozen=True, slots=True)
-class GraphKey:
+class ReplayKey:
     """What Python decides by in the work: work with equal keys launches the same kernels.
 
     Args:
@@ -98,8 +98,8 @@ def _copy(x: Tensor | Camera | None) -> Tensor | Camera | None:
     return None if x is None else x.clone(memory_format=torch.contiguous_format)
 
 
-class Recorded(Generic[T]):
-    """Recorded work.
+class Replay(Generic[T]):
+    """A recording with the inputs that it reads.
 
     Args:
         recording: of the work. inputs: those that it reads.
@@ -132,21 +132,19 @@ class Replays:
 
     def __init__(self, device: torch.device, name: str, count: Callable[[str], None] = lambda reason: None) -> None:
         self._device, self._name, self._count = device, name, count
-        self._recorded: dict[GraphKey, Any] = {}  # None: to be recorded
+        self._replays: dict[ReplayKey, Any] = {}  # None: to be recorded
         self._warm = set[tuple[Any, ...]]()  # keys, apart from rows and addresses, of work that has run live
         self._structure: tuple[int, tuple[int, ...]] = (-1, ())  # the rows and addresses of a key
         self._moves = 0  # changes of them since the last replay
         self._guard_failures = 0.0  # less what the replays since then have saved
         self._failed = False
 
-    def do(
-        self, key: GraphKey, t: int, inputs: Given, *, live: Callable[[], T], record: Callable[[], Recorded[T]]
-    ) -> T:
+    def do(self, key: ReplayKey, t: int, inputs: Given, *, live: Callable[[], T], record: Callable[[], Replay[T]]) -> T:
         """Do the work live, while it is recorded, or by a replay."""
         if self._failed:
             return self._live(live, _FAILED)
         if (structure := (key.rows, key.addresses)) != self._structure:  # it has changed, and no recording holds
-            self._recorded.clear()
+            self._replays.clear()
             self._structure, self._moves = structure, self._moves + 1
             if self._moves == _MOST_MOVES:
                 _log.warning(
@@ -155,41 +153,41 @@ class Replays:
                     "to Strategy.state in place, by copy_().",
                     self._name,
                 )
-        if key not in self._recorded:
-            if len(self._recorded) == _MOST_RECORDINGS:
+        if key not in self._replays:
+            if len(self._replays) == _MOST_RECORDINGS:
                 return self._live(live, f"more than {_MOST_RECORDINGS} kinds")
-            self._recorded[key] = None
+            self._replays[key] = None
             elsewhere = len(key.addresses), key.shapes, key.constants
             if elsewhere not in self._warm or self._moves > 1:  # a recording does not pay if addresses change each time
                 self._warm.add(elsewhere)
                 with on_side_stream(self._device):  # some caches belong to a stream
                     return self._live(live, "the first of its kind")
         try:
-            recorded = self._recorded[key]
-            if recorded is not None and not recorded.holds_at(t):
-                recorded, self._guard_failures = None, self._guard_failures + 1
+            replay = self._replays[key]
+            if replay is not None and not replay.holds_at(t):
+                replay, self._guard_failures = None, self._guard_failures + 1
                 if self._guard_failures > _MOST_GUARD_FAILURES:
                     raise RuntimeError(
                         "a strategy decides by the iteration, or by what it stores in Python, and again and again another way. "
                         "Numbers that it changes belong in tensors that it writes in place."
                     )
-            if recorded is None:
-                recorded = record()
-            elif recorded.replay(inputs):
+            if replay is None:
+                replay = record()
+            elif replay.replay(inputs):
                 self._moves, self._guard_failures = 0, max(0.0, self._guard_failures - 1 / _PAYS_AFTER)
             else:  # the next recording has space for more
-                recorded, reason = None, "the recorded lists of pairs are too short"
+                replay, reason = None, "the recorded lists of pairs are too short"
         except Exception as error:
-            self._failed, recorded, reason = True, None, _FAILED
-            self._recorded.clear()
+            self._failed, replay, reason = True, None, _FAILED
+            self._replays.clear()
             cause = f"{type(error).__name__}: {error}".partition("\n")[0]
             _log.warning("%s ends at t=%d, and iterations are live from now on: %s", self._name, t, cause)
-        self._recorded[key] = recorded
-        return self._live(live, reason) if recorded is None else recorded.outcome()
+        self._replays[key] = replay
+        return self._live(live, reason) if replay is None else replay.outcome()
 
     def release(self) -> None:
         """Drop all recordings, with their memory on the device."""
-        self._recorded.clear()
+        self._replays.clear()
 
     def _live(self, live: Callable[[], T], reason: str) -> T:
         self._count(reason)

@@ -92,7 +92,7 @@ class CompiledStep:
         passes: the passes' implementation; None: that for the device of the optimizer's moments.
 
     Attributes:
-        records: whether a step can be part of a recording.
+        recordable: whether a step can be part of a recording.
         bands: how many bands of shN the last step could change, the lowest ones.
     """
 
@@ -101,7 +101,7 @@ class CompiledStep:
     ) -> None:
         self.conductor, self.optimizer, self.skips = conductor, optimizer, skips
         self._passes = gaussian_pass(optimizer) if passes is None else passes
-        self.records = getattr(self._passes, "records", False)
+        self.recordable = getattr(self._passes, "recordable", False)
         self._numbers: Tensor | None = None  # on the device: `count` writes them before each replay of a recording
         self.bands, self._restored = 0, -1  # see `_find_bands`; `Adam.restored`, then
 

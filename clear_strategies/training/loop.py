@@ -31,7 +31,7 @@ from clear_strategies.signals import Interrupted, deferred_signals, foremost
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
-from clear_strategies.training.replayed_iteration import ExtraViewInputs, ViewInputs, replayable, replays_for
+from clear_strategies.training.replayed_iteration import ExtraViewInputs, ViewInputs, replayed, replays_for
 from clear_strategies.training.state import TrainState
 from rasterizers import native
 from rasterizers.interface import Camera, Color, Rasterizer, over
@@ -66,11 +66,11 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
     s.advance()
 
 
-@replayable
+@replayed
 def learn(s: TrainState, rasterizer: Rasterizer, inputs: ViewInputs) -> tuple[Update, dict[str, Number]]:
     """What an iteration does with its view: render, compare, step on the merged gradient, and accumulate statistics.
 
-    Nothing here may read a number from the device, see `replayable`.
+    Nothing here may read a number from the device, see `replayed`.
     """
     t, view, θ, conductor, stage = inputs.t, inputs.view, s.field, s.conductor, s.conductor.work_log.stage
     with stage(f"render {' + '.join(scale.upper() for scale, wanted in inputs.scales.items() if wanted)}"):
@@ -137,7 +137,7 @@ def extra_steps(
     return row
 
 
-@replayable
+@replayed
 def learn_extra(s: TrainState, rasterizer: Rasterizer, inputs: ExtraViewInputs) -> tuple[None, dict[str, Number]]:
     """What an iteration does with an extra view."""
     θ, extra, where = s.field, inputs.view, f"t={inputs.t}, an extra view"

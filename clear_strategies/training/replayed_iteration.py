@@ -22,12 +22,12 @@ from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.kernels import native
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Update
-from clear_strategies.merging.recorded_work import RecordedWork, merging_strategies, replays_on, why_not_recorded
+from clear_strategies.merging.replay import LoggedReplay, logged_replays, merging_strategies, why_not_recordable
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.state import TrainState
-from rasterizers.interface import Color, Rasterizer, Recordable, can_be_recorded, over
-from rasterizers.replays import Given, GraphKey, Replays, shapes_of
+from rasterizers.interface import Color, Rasterizer, Recordable, is_recordable, over
+from rasterizers.replays import Given, ReplayKey, Replays, shapes_of
 
 _log = logging.getLogger(__name__)
 
@@ -121,14 +121,14 @@ def replays_for(s: TrainState, rasterizer: Rasterizer) -> Replays | None:
     """The replays of this training; None if its iterations cannot be recorded. A log line gives the reason: a warning if the
     settings ask for replays.
     """
-    reason = next(_why_not(s, rasterizer), None)
+    reason = next(_why_not_recordable(s, rasterizer), None)
     if reason is None:
-        return replays_on(s.device, s.conductor, "fit.replay")
+        return logged_replays(s.device, s.conductor, "fit.replay")
     _log.log(logging.WARNING if s.settings.replay else logging.INFO, "Iterations are not replayed: %s.", reason)
     return None
 
 
-def replayable(learn: Callable[[TrainState, Rasterizer, Inputs], L]) -> Callable[[TrainState, Rasterizer, Inputs], L]:
+def replayed(learn: Callable[[TrainState, Rasterizer, Inputs], L]) -> Callable[[TrainState, Rasterizer, Inputs], L]:
     """The function, recorded and replayed in a training that has `replays`. Its work may read no number from the device."""
 
     @wraps(learn)
@@ -147,8 +147,8 @@ def replayable(learn: Callable[[TrainState, Rasterizer, Inputs], L]) -> Callable
             background, *others = copies
             return learn(s, drawn_by.over_changing(background), inputs.reading(others))
 
-        def record() -> RecordedWork[Update | None]:
-            return RecordedWork(
+        def record() -> LoggedReplay[Update | None]:
+            return LoggedReplay(
                 s.device, s.conductor, recorded, given, inputs.t, calls=inputs.calls(s.conductor),
                 numbers_of=partial(drawn_by.numbers_of, device=s.device), count=cast(CompiledStep, s.compiled_step).count,
             )  # fmt: skip
@@ -163,18 +163,18 @@ def replayable(learn: Callable[[TrainState, Rasterizer, Inputs], L]) -> Callable
     return learned
 
 
-def _why_not(s: TrainState, rasterizer: Rasterizer) -> Iterator[str]:
-    if not can_be_recorded(rasterizer):
+def _why_not_recordable(s: TrainState, rasterizer: Rasterizer) -> Iterator[str]:
+    if not is_recordable(rasterizer):
         yield f"{type(rasterizer).__name__} cannot be recorded; rasterizer=warp can"
-    if s.compiled_step is None or not s.compiled_step.records:
+    if s.compiled_step is None or not s.compiled_step.recordable:
         yield "the per-Gaussian step is not that of Warp"
     chosen = s.conductor.objective.kernels
     if (native.fastest(s.device) if chosen == "auto" else chosen) != "warp":
         yield "the losses are not those of Warp (objective.kernels)"
-    yield from why_not_recorded(s.conductor)
+    yield from why_not_recordable(s.conductor)
 
 
-def _key(s: TrainState, inputs: ViewInputs | ExtraViewInputs, given: Given) -> GraphKey:
+def _key(s: TrainState, inputs: ViewInputs | ExtraViewInputs, given: Given) -> ReplayKey:
     λ = s.conductor.objective.lambda_hr(inputs.t)
     tables = s.field.raw(), s.optimizer.first, s.optimizer.second, s.conductor.state_dict()
     statistics = [x for x in s.density.state_dict().values() if x.dim() > 0]  # numbers are made for a checkpoint
@@ -182,4 +182,4 @@ def _key(s: TrainState, inputs: ViewInputs | ExtraViewInputs, given: Given) -> G
     addresses = [x.data_ptr() for x in stored]
     bands = max(cast(CompiledStep, s.compiled_step).bands, (s.field.degree + 1) ** 2 - 1)  # that the step will change
     constants = s.field.degree, bands, inputs.view.background, λ > 0, *inputs.constants(s)
-    return GraphKey(n := len(s.field), tuple(addresses), shapes_of(given, n), constants)
+    return ReplayKey(n := len(s.field), tuple(addresses), shapes_of(given, n), constants)

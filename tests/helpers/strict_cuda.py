@@ -311,7 +311,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     import rasterizers.native
     from clear_strategies.core import deferred
     from clear_strategies.kernels import native
-    from clear_strategies.merging import recorded_work
+    from clear_strategies.merging import replay
     from rasterizers import recording, replayed_drawing, sending, warp_runtime
     from rasterizers.warp_backend import frame
 
@@ -396,7 +396,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         recording: {"_side_stream": cache(lambda device: Stream(cuda, records=True))},
         deferred: {"is_immediate": lambda x: False},
         native: {"available": lambda: False, "fastest": lambda device: "warp"},
-        recorded_work: {"can_record": lambda device: True},
+        replay: {"can_record": lambda device: True},
         replayed_drawing: {"can_record": lambda device: True, "_thread": replayed_drawing._Thread()},
         rasterizers.native: {"empty": on_no_cpu},
         frame: {"_read_deferred": reads},

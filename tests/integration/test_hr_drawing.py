@@ -11,8 +11,8 @@ import clear_strategies as cs
 import rasterizers
 from clear_strategies import Conductor
 from clear_strategies.core.view import ExtraView
-from clear_strategies.merging import recorded_work
-from clear_strategies.merging.recorded_work import LIVE, RecordedWork
+from clear_strategies.merging import replay
+from clear_strategies.merging.replay import LIVE, LoggedReplay
 from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import Ramp, WarmupDecay
 from integration import hr_drawing, replayed_merge
@@ -246,7 +246,7 @@ def scene(recorded_on):
 
 
 def record_nothing(monkeypatch):
-    for module in (recorded_work, replayed_drawing):
+    for module in (replay, replayed_drawing):
         monkeypatch.setattr(module, "can_record", lambda device: False)
 
 
@@ -356,13 +356,13 @@ def test_replays_over_densification_resets_evaluation_and_resuming(monkeypatch, 
     names = [scene.train[i % 3].name for i in range(20)]
     living = WeakSet()
 
-    class Seen(RecordedWork):
+    class Seen(LoggedReplay):
         def __init__(self, *args, **kwargs):
             super().__init__(*args, **kwargs)
             living.add(self)
 
     for module in (hr_drawing, replayed_merge):
-        monkeypatch.setattr(module, "RecordedWork", Seen)
+        monkeypatch.setattr(module, "LoggedReplay", Seen)
 
     def begun(host):
         host.degree = lambda step: 3
@@ -383,7 +383,7 @@ def test_replays_over_densification_resets_evaluation_and_resuming(monkeypatch, 
 
         host.train(names, between=evaluate)
         logs = [clear.attachment.conductor.work_log]
-        assert len(living) == (2 if recorded_work.can_record(recorded_on) else 0)
+        assert len(living) == (2 if replay.can_record(recorded_on) else 0)
         clear.remove()
         assert not living
         resumed = Host(scene, rasterization=drawn_by("warp"), extent=4.0)

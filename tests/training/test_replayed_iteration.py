@@ -17,19 +17,19 @@ from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.density.mcmc import MCMC
-from clear_strategies.merging import recorded_work
-from clear_strategies.merging.recorded_work import LIVE, _stored_by
+from clear_strategies.merging import replay
+from clear_strategies.merging.replay import LIVE, _stored_by
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from clear_strategies.training import checkpoint, loop
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
-from clear_strategies.training.replayed_iteration import replayable, replays_for
+from clear_strategies.training.replayed_iteration import replayed, replays_for
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from rasterizers import replays
 from rasterizers.recording import Recording, running
-from rasterizers.replays import GraphKey, Replays, shapes_of
+from rasterizers.replays import ReplayKey, Replays, shapes_of
 from tests.helpers.backends import needs
 from tests.helpers.short_run import SCENE, tensors, with_depth
 from tests.training.test_resume import without_time
@@ -297,7 +297,7 @@ def test_recordings_of_an_earlier_structure_are_dropped():
 
     for address in range(2 * replays._MOST_RECORDINGS):
         rows = 5 + address // 2
-        key = GraphKey(rows, (address,), shapes_of([torch.zeros(rows, 3)], rows), ())
+        key = ReplayKey(rows, (address,), shapes_of([torch.zeros(rows, 3)], rows), ())
         found = [kept.do(key, 1, [], live=lambda: "live", record=recorded) for _ in range(3)]
         assert found == ["replayed" if address else "live", "replayed", "replayed"]
         assert len(made) == address + 1
@@ -322,7 +322,7 @@ def test_work_is_recorded_anew_as_long_as_recordings_pay_off(lasts, pays):
                 holds_at=lambda now: now // lasts == t // lasts, replay=lambda _: True, outcome=lambda: "replayed"
             )
 
-        return kept.do(GraphKey(1, (), (), ()), t, [], live=lambda: "live", record=record)
+        return kept.do(ReplayKey(1, (), (), ()), t, [], live=lambda: "live", record=record)
 
     found = [do(t) for t in range(240)]
     assert found[1] == "replayed"
@@ -331,7 +331,7 @@ def test_work_is_recorded_anew_as_long_as_recordings_pay_off(lasts, pays):
 
 def test_memory_that_is_new_in_each_iteration_is_told_and_not_recorded(caplog):
     kept = Replays(DEVICE, "")
-    found = [kept.do(GraphKey(1, (k,), (), ()), k, [], live=lambda: "live", record=fails) for k in range(30)]
+    found = [kept.do(ReplayKey(1, (k,), (), ()), k, [], live=lambda: "live", record=fails) for k in range(30)]
     assert set(found) == {"live"}
     assert caplog.text.count("Write to Strategy.state in place") == 1
 
@@ -478,7 +478,7 @@ def test_a_number_of_the_run_is_read_where_it_lies(in_place):
 
 
 def test_a_number_of_the_run_that_the_host_reads_holds_as_what_a_strategy_stores_in_python(monkeypatch):
-    monkeypatch.setattr(recorded_work, "can_record", lambda device: False)
+    monkeypatch.setattr(replay, "can_record", lambda device: False)
     strategy = ByMean()
     strategy.on_fit_start(1, 0)
     before = _stored_by(strategy)
@@ -561,7 +561,7 @@ def test_what_cannot_be_recorded_is_live_from_then_on_and_one_line_says_why(faul
             fault(s.field.means.data)
         return learned
 
-    monkeypatch.setattr(loop, "learn", replayable(faulty))
+    monkeypatch.setattr(loop, "learn", replayed(faulty))
     assert live_in(both(lambda: start(density=False), 8)) == {FIRST: 2, FAILED: 6}
     require_one_line(caplog, 3)
 

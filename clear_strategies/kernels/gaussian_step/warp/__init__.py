@@ -42,7 +42,7 @@ class WarpGaussianStep:
         TypeError, ValueError: a tensor is not float32, contiguous and on that device, or has a wrong shape.
     """
 
-    records: Final = True
+    recordable: Final = True
 
     def __init__(
         self, activation: Mapping[str, Tensor], lr: Mapping[str, Tensor], hr: Mapping[str, Tensor] | None

@@ -1,4 +1,4 @@
-"""Recording of strategies, on top of `rasterizers.replays`: logs, counts of skipped work, and checks of what can be recorded."""
+"""Replays of work with strategies, on top of `rasterizers.replays`: logs, counts of skipped work, what is recordable."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from clear_strategies.strategies.base import Strategy, overrides
 from rasterizers.guards import Guarded
 from rasterizers.interface import Camera
 from rasterizers.recording import Recording
-from rasterizers.replays import Given, Recorded, Replays, StaticInputs, can_record
+from rasterizers.replays import Given, Replay, Replays, StaticInputs, can_record
 
 T = TypeVar("T")
 
@@ -24,8 +24,8 @@ LIVE: Final = "live in place of a replay"
 """The work log's entry for work that was not replayed. It counts reasons and no runs, so that no work seems to be saved."""
 
 
-class RecordedWork(Recorded[tuple[T, dict[str, Number]]]):
-    """Recorded work, with counts of what it skips, numbers for the history, and the logs of strategies.
+class LoggedReplay(Replay[tuple[T, dict[str, Number]]]):
+    """A replay with counts of what the work skips, numbers for the history, and the logs of strategies.
 
     Its outcome is the result of the work, whose tensors the next replay overwrites, and a copy of the numbers.
 
@@ -109,14 +109,14 @@ def _comparable(x: Any) -> Any:
     return id(x), x, _comparable(getattr(x, "__dict__", None) or ())
 
 
-def replays_on(device: torch.device, conductor: Conductor, name: str) -> Replays | None:
+def logged_replays(device: torch.device, conductor: Conductor, name: str) -> Replays | None:
     """`Replays` whose live work the work log counts as `LIVE`; None if work on the device cannot be recorded."""
     if not can_record(device):
         return None
     return Replays(device, name, lambda reason: conductor.work_log.skip(LIVE, reason))
 
 
-def why_not_recorded(conductor: Conductor) -> Iterator[str]:
+def why_not_recordable(conductor: Conductor) -> Iterator[str]:
     """A reason for each strategy that may depend on more of a view than `looked_up` returns. A class that overrides it speaks for
     its own hooks, and not for those that a subclass overrides.
     """
