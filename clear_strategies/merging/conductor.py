@@ -34,7 +34,7 @@ from clear_strategies.merging.iteration import (
     guarded,
     require_finite_parts,
 )
-from clear_strategies.merging.logs import IterationLogs, computed
+from clear_strategies.merging.logs import IterationLogs
 from clear_strategies.merging.objective import Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.strategies.base import RunFacts, Scale, Strategy
@@ -181,7 +181,6 @@ class Conductor(Hooks):
                 f"this objective needs the {'HR' if reduced else 'LR'} scale at t={t}, got None. Render what wants_lr "
                 "and wants_hr(t) ask for."
             )
-        self.logs.keep()
         known = Step(t, view, params=params, looked_up=looked_up)
         step = self._told(known)
         _require_size(view, "hr" if reduced else "lr", rendered.image)
@@ -215,8 +214,7 @@ class Conductor(Hooks):
                 grads, conflict = None, stepper.step(params, rendered, g_lr, from_hr, t)
         of_hr: Any = {} if from_hr is None else from_hr.losses  # scalars, as of all that is no replay
         losses = {**l_lr.values, **of_hr}
-        logs = computed(self.logs.scalars(since_kept=True))
-        return Update(step, grads, score, ordinary, conflict, losses, logs, l_lr.cotangents)
+        return Update(step, grads, score, ordinary, conflict, losses, l_lr.cotangents)
 
     @apart_from_the_loop
     def hr_gradients(

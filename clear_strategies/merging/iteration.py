@@ -73,10 +73,10 @@ class Update:
         score: S_i, the statistic that densification uses; `ordinary` is that of 3DGS, without strategies. None if no
             densification reads them.
         conflict: share of Gaussians in conflict before correction, by group and as "gaussian"; empty without HR.
-        losses: scalars by name. logs: the scalars that the strategies logged in the update.
+        losses: scalars by name.
         cotangents_lr: the gradient of λ_LR L_LR with respect to the LR image, [1, H, W, 3].
 
-    On a device, losses, conflict and logs become floats by `deferred.read`.
+    On a device, losses and conflict become floats by `deferred.read`.
     """
 
     step: Step
@@ -85,7 +85,6 @@ class Update:
     ordinary: Float[Tensor, " N"] | None
     conflict: Mapping[str, Number] = field(default_factory=dict)
     losses: Mapping[str, Scalar] = field(default_factory=dict)
-    logs: Mapping[str, Number] = field(default_factory=dict)
     cotangents_lr: Float[Tensor, "1 H W 3"] | None = None
 
 

@@ -28,20 +28,18 @@ class IterationLogs:
             kept.update(s.logs)
             s.logs.clear()
 
-    def scalars(self, columns: Collection[str] = (), *, since_kept: bool = False) -> dict[str, Logged]:
+    def scalars(self, columns: Collection[str] = ()) -> dict[str, Logged]:
         """The scalars as they were logged, see `computed`. A name that another strategy has logged too is prefixed by the class.
 
         Args:
             columns: of the row that the scalars are added to.
-            since_kept: those alone that were logged since `keep`.
 
         Raises:
             AnswerError: one of these columns was logged.
         """
         logged: dict[str, Logged] = {}
         for owner, kept, s in zip(by_class(self._strategies), self._kept, self._strategies, strict=True):
-            own = s.logs if since_kept else kept | s.logs
-            logged |= {f"{owner}.{name}" if name in logged else name: x for name, x in own.items()}
+            logged |= {f"{owner}.{name}" if name in logged else name: x for name, x in (kept | s.logs).items()}
         if taken := logged.keys() & columns:
             raise AnswerError(
                 f"a strategy logs {min(taken)!r}, a column that the row has already. Give it another name."

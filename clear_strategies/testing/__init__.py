@@ -20,6 +20,7 @@ from clear_strategies.core import deferred
 from clear_strategies.core.gradients import screen_of
 from clear_strategies.errors import AnswerError, DivergedError
 from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.logs import computed
 from clear_strategies.schedules import scaled
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.testing import given
@@ -107,7 +108,7 @@ def check_answers_have_their_shapes(make: Make) -> None:
                 require(bool(((q >= 0) & (q <= 1)).all()), "evidence must lie in [0, 1]")
         if (router := conductor.owner("route")) is not None:
             require(bool((torch.as_tensor(router.route(update.step)) >= 0).all()), "route() must give numbers >= 0")
-        deferred.read([*update.logs.values()])
+        deferred.read([*computed(conductor.logs.scalars()).values()])
         without_error("draw", f"at t={t}", conductor.draw, t, params["means"], given.enlarged)
         conductor.extra_views(t)
         memory = {name: p.data_ptr() for name, p in params.items()}
