@@ -172,7 +172,7 @@ class Conductor(Hooks):
             DivergedError: a loss or a gradient is not finite; `params` and the optimizer are unchanged.
         """
         self.require_run(self.run)
-        stage, where = self.work_log.stage, _where(view, t)
+        stage = self.work_log.stage
         vjp: Callable[..., Sequence[Grads]] = _vjp if stepper is None else stepper.vjp
         reduced = not self.wants_lr or (lr is None and view.factor == 1)
         rendered = hr if reduced else lr
@@ -181,11 +181,10 @@ class Conductor(Hooks):
                 f"this objective needs the {'HR' if reduced else 'LR'} scale at t={t}, got None. Render what wants_lr "
                 "and wants_hr(t) ask for."
             )
-        known = Step(t, view, params=params, looked_up=looked_up)
-        step = self._told(known)
+        step = Step(t, view, params=params, looked_up=looked_up)
         _require_size(view, "hr" if reduced else "lr", rendered.image)
         image = rendered.image.detach()
-        l_lr = self._losses("lr", images.area_mean(image, view.factor) if reduced else image, known, step)  # Eq. 4
+        l_lr = self._losses("lr", images.area_mean(image, view.factor) if reduced else image, step)  # Eq. 4
         g_lr: Any = None
         from_hr: HrSide | None = None
         if not reduced:
@@ -196,25 +195,26 @@ class Conductor(Hooks):
         else:
             # Where Î_LR is the area mean of Î_HR, the cotangent of L_LR passes through the same HR render.
             through_mean = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
-            from_hr = self.hr_gradients(hr, known, vjp, lr_cotangents=through_mean)
-            g_lr, step = from_hr.lr if reduced else g_lr, from_hr.step
+            from_hr = self.hr_gradients(hr, step, vjp, lr_cotangents=through_mean)
+            g_lr = from_hr.lr if reduced else g_lr
+        told = self._told(step) if from_hr is None else from_hr.step
         with stage("strategies" if stepper is None else "per-Gaussian pass"):
             score = ordinary = None
             if scored:
                 weights = (self.objective if stepper is None else stepper).weights(t)
                 screen_lr = to_ndc(screen_of(g_lr), _size(rendered.image))
                 score, ordinary = self.scores(screen_lr, from_hr, weights)  # S^dens   Eq. 14
-            require_finite_parts(where, g_lr, from_hr)
+            require_finite_parts(_where(step), g_lr, from_hr)
             if stepper is None:
                 g_hr = Grads() if from_hr is None else from_hr.routed
-                merged = self.merge(params, g_lr.without_detail(), g_hr, step, t, finite=True)
-                require_finite(f"{where}: the merged gradient", merged.grads)
+                merged = self.merge(params, g_lr.without_detail(), g_hr, told, t, finite=True)
+                require_finite(f"{_where(step)}: the merged gradient", merged.grads)
                 grads, conflict = merged.grads, merged.conflict
             else:
                 grads, conflict = None, stepper.step(params, rendered, g_lr, from_hr, t)
         of_hr: Any = {} if from_hr is None else from_hr.losses  # scalars, as of all that is no replay
         losses = {**l_lr.values, **of_hr}
-        return Update(step, grads, score, ordinary, conflict, losses, l_lr.cotangents)
+        return Update(told, grads, score, ordinary, conflict, losses, l_lr.cotangents)
 
     @apart_from_the_loop
     def hr_gradients(
@@ -235,15 +235,14 @@ class Conductor(Hooks):
         """
         stage, λ_hf = self.work_log.stage, self.objective.lambda_hf
         _require_size(step.view, "hr", hr.image)
-        known = replace(step, visible=hr.visible)
-        step = self._told(known)
-        losses = self._losses("hr", hr.image.detach(), known, step)  # Eq. 5
+        step = replace(step, visible=hr.visible)
+        losses = self._losses("hr", hr.image.detach(), step)  # Eq. 5
         of_hr = losses.cotangents
         if len(of_hr) == 2 and not (apart or self.owner("route") is not None or self.owner("score") is not None):
             of_hr = torch.add(of_hr[:1], of_hr[1:], alpha=λ_hf)
         has_hf, n = len(of_hr) == 2, len(hr.visible)
         with stage("evidence"):
-            step = self.observed(step, hr)  # q, a, w        Eq. 9, 10
+            step = self.observed(self._told(step), hr)  # q, a, w        Eq. 9, 10
             m = self.route(step, n) if has_hf else 1.0  # m              Eq. 12
         with stage("backward HR"):  # one pass for all cotangents
             cotangents = of_hr if lr_cotangents is None else torch.cat((lr_cotangents, of_hr))
@@ -329,21 +328,17 @@ class Conductor(Hooks):
         self._hr_cotangents = None
         super().on_fit_end()
 
-    def _losses(self, scale: Scale, image: Float[Tensor, "H W 3"], known: Step, step: Step) -> Losses:
-        """The losses of a render against the photo of its scale, which lies over the background of the iteration.
-
-        Args:
-            known: the iteration. step: the same as strategies see it.
-        """
-        view, is_lr = known.view, scale == "lr"
+    def _losses(self, scale: Scale, image: Float[Tensor, "H W 3"], step: Step) -> Losses:
+        """The losses of a render against the photo of its scale, which lies over the background of the iteration."""
+        view, is_lr = step.view, scale == "lr"
         with self.work_log.stage(f"losses {scale.upper()}"):
-            photo = self._over_background(view.lr if is_lr else view.hr, known.t, view.background)
+            photo = self._over_background(view.lr if is_lr else view.hr, step.t, view.background)
             losses = self.objective.lr if is_lr else self._hr_losses
-            compare = self.comparison(scale, photo, step, lambda x: losses(x, photo.image, photo.shown))
+            compare = self.comparison(scale, photo, self._told(step), lambda x: losses(x, photo.image, photo.shown))
             found = compare(image)
         target = "the LR photo" if is_lr else "the SR image"
         compared = {target: photo.image, f"the {scale.upper()} render": image}
-        require_finite_losses(_where(view, known.t), found.values, compared)
+        require_finite_losses(_where(step), found.values, compared)
         return found
 
     def _hr_losses(
@@ -361,6 +356,8 @@ class Conductor(Hooks):
 
     def _told(self, step: Step) -> Step:
         """The iteration as strategies see it; in a recording, they cannot read from it what differs between replays."""
+        if running() is None:
+            return step
         view = guarded(step.view, over_changing=self.owner("background") is not None)
         return replace(step, t=iteration(step.t), view=view)
 
@@ -387,8 +384,8 @@ def _require_size(view: View, scale: Scale, render: Tensor) -> None:
         raise ValueError(f"view {view.name}: {rule}, got {[*render.shape]}. Draw it by view.{scale}.camera.")
 
 
-def _where(view: View, t: int) -> str:
-    return f"t={t}, view {view.name}"
+def _where(step: Step) -> str:
+    return f"t={step.t}, view {step.view.name}"
 
 
 def _size(image: Float[Tensor, "H W 3"]) -> tuple[int, int]:

@@ -15,7 +15,6 @@ from clear_strategies.core.gradients import Grads
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import Photo, View
 from rasterizers.guards import unread
-from rasterizers.recording import running
 
 LossWeights = tuple[float, float] | Tensor
 """λ_HR(t) and λ_HR(t) λ_HF: two numbers, or a tensor of them on the device, [2]."""
@@ -126,14 +125,11 @@ def require_finite_parts(where: str, g_lr: Grads, hr: HrSide | None) -> None:
 
 
 def guarded(view: View, *, over_changing: bool) -> View:
-    """The view that strategies get. In a recording they may read only its images, which are copied before each replay.
+    """The view that strategies get in a recording. They may read only its images, which are copied before each replay.
 
     Args:
         over_changing: a strategy chooses the background, so transparent images differ between replays.
     """
-    if running() is None:
-        return view
-
     def layer(x: Any, what: str) -> Any:
         return None if x is None else unread(x, f"the {what} of the view", ("shape", "dtype"))
 
