@@ -15,7 +15,6 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.conflicts import Weights
-from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite, require_finite_losses
 from clear_strategies.core.gradients import Grads, ScreenGradients, Shot, screen_norm, screen_of, summed, to_ndc
 from clear_strategies.core.step import Losses, Step
@@ -26,10 +25,10 @@ from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.hooks import Hooks
 from clear_strategies.merging.iteration import (
+    VJP,
     HrSide,
     LossWeights,
     Merged,
-    Stepper,
     Update,
     guarded,
     require_finite_parts,
@@ -144,36 +143,50 @@ class Conductor(Hooks):
             return False
         return self.wants_lr
 
-    @apart_from_the_loop
     def update(
-        self,
-        params: Mapping[str, Tensor],
-        lr: Shot | None,
-        hr: Shot | None,
-        view: View,
-        t: int,
-        stepper: Stepper | None = None,
-        *,
-        scored: bool = True,
-        looked_up: Tensor | None = None,
-    ) -> Update:
+        self, params: Mapping[str, Tensor], lr: Shot | None, hr: Shot | None, view: View, t: int
+    ) -> Update:  # fmt: skip
         """The merged gradient of one view, in place of `backward()`.
 
         Args:
             params: raw parameters by attribute. lr, hr: this view rendered at both scales. hr None skips HR; lr None
                 stands for the area mean of hr, where `wants_lr` is False or both scales have one size.
-            stepper: merges and steps in one pass; None: `merge`, and the caller steps.
-            scored: False: no densification reads the scores of this iteration.
-            looked_up: see `Step.looked_up`.
 
         Raises:
             ValueError: a scale that the objective needs was not rendered.
             StrategyConflict: one of the strategies has begun the run of another conductor.
             DivergedError: a loss or a gradient is not finite; `params` and the optimizer are unchanged.
         """
+        g_lr, from_hr, update = self.gradients(params, lr, hr, view, t)
+        with self.work_log.stage("strategies"):
+            g_hr = Grads() if from_hr is None else from_hr.routed
+            merged = self.merge(params, g_lr, g_hr, update.step, t, finite=True)
+        return replace(update, grads=merged.grads, conflict=merged.conflict)
+
+    @apart_from_the_loop
+    def gradients(
+        self,
+        params: Mapping[str, Tensor],
+        lr: Shot | None,
+        hr: Shot | None,
+        view: View,
+        t: int,
+        vjp: VJP | None = None,
+        *,
+        scored: bool = True,
+        weights: LossWeights | None = None,
+        looked_up: Tensor | None = None,
+    ) -> tuple[Grads, HrSide | None, Update]:
+        """The first part of `update`: g_LR without f_det, the HR side, and the update without what the merge adds to it.
+
+        Args:
+            vjp: of both renderings; None: `Shot.vjp`.
+            scored: False: no densification reads the scores of this iteration.
+            weights: as of `Objective.weights`, on the device in a recording.
+            looked_up: see `Step.looked_up`.
+        """
         self.require_run(self.run)
-        stage = self.work_log.stage
-        vjp: Callable[..., Sequence[Grads]] = _vjp if stepper is None else stepper.vjp
+        stage, vjp = self.work_log.stage, vjp or _vjp
         reduced = not self.wants_lr or (lr is None and view.factor == 1)
         rendered = hr if reduced else lr
         if rendered is None:
@@ -197,31 +210,24 @@ class Conductor(Hooks):
             through_mean = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
             from_hr = self.hr_gradients(hr, step, vjp, lr_cotangents=through_mean)
             g_lr = from_hr.lr if reduced else g_lr
-        told = self._told(step) if from_hr is None else from_hr.step
-        with stage("strategies" if stepper is None else "per-Gaussian pass"):
-            score = ordinary = None
-            if scored:
-                weights = (self.objective if stepper is None else stepper).weights(t)
+        score = ordinary = None
+        if scored:
+            with stage("densification score"):
+                weights = self.objective.weights(t) if weights is None else weights
                 screen_lr = to_ndc(screen_of(g_lr), _size(rendered.image))
                 score, ordinary = self.scores(screen_lr, from_hr, weights)  # S^dens   Eq. 14
-            require_finite_parts(_where(step), g_lr, from_hr)
-            if stepper is None:
-                g_hr = Grads() if from_hr is None else from_hr.routed
-                merged = self.merge(params, g_lr.without_detail(), g_hr, told, t, finite=True)
-                require_finite(f"{_where(step)}: the merged gradient", merged.grads)
-                grads, conflict = merged.grads, merged.conflict
-            else:
-                grads, conflict = None, stepper.step(params, rendered, g_lr, from_hr, t)
+        require_finite_parts(_where(step), g_lr, from_hr)
         of_hr: Any = {} if from_hr is None else from_hr.losses  # scalars, as of all that is no replay
-        losses = {**l_lr.values, **of_hr}
-        return Update(told, grads, score, ordinary, conflict, losses, l_lr.cotangents)
+        told = self._told(step) if from_hr is None else from_hr.step
+        update = Update(told, None, score, ordinary, {}, {**l_lr.values, **of_hr}, l_lr.cotangents)
+        return g_lr.without_detail(), from_hr, update
 
     @apart_from_the_loop
     def hr_gradients(
         self,
         hr: Shot,
         step: Step,
-        vjp: Callable[..., Sequence[Grads]] | None = None,
+        vjp: VJP | None = None,
         *,
         apart: bool = True,
         lr_cotangents: Float[Tensor, "1 H W 3"] | None = None,
@@ -229,7 +235,7 @@ class Conductor(Hooks):
         """Compare Î_HR with the SR image, ask for the evidence, and backpropagate both losses in one pass.
 
         Args:
-            step: the iteration. vjp: as `Stepper.vjp`; None: by `Shot.vjp`.
+            step: the iteration. vjp: of the rendering; None: `Shot.vjp`.
             apart: False: one cotangent, of L_base + λ_HF L_HF, unless a strategy routes or scores by L_HF.
             lr_cotangents: of λ_LR L_LR, if its gradient passes through this render, too.
         """
@@ -301,26 +307,25 @@ class Conductor(Hooks):
             g_hr: g^HR of Eq. 13, and m λ_HF ∇L_HF of f_det; empty without HR. step: the iteration, with the evidence.
             out: receives the merged gradient, by attribute, contiguous; None: new tensors, for what has a gradient.
             lambda_hr: λ_HR(t) > 0 on the device, in a recording.
-            finite: check also that the strategies' answers are finite.
+            finite: check that the strategies' answers and the merged gradient are finite.
+
+        Raises:
+            DivergedError: the merged gradient is not finite.
         """
         λ = self.objective.lambda_hr(t) if lambda_hr is None else lambda_hr
-        plus = self.regularized(params, t, finite=finite)
+        compared = (lambda_hr is not None or λ > 0) and reconcile.common_groups(g_lr, g_hr)
+        products, like = reconcile.products(g_lr, g_hr) if compared else None, params if out is None else out
+        weights, plus, conflict = self.answers(  # ĝ^HR           Eq. 6, 7, 11
+            products, lambda: (dense(g_lr, like), dense(g_hr.without_detail(), like)), params, step, t, finite=finite
+        )
+        if not isinstance(weights, Weights):
+            g_hr, weights = Grads({**weights, **{name: g for name, g in g_hr.items() if name == "detail"}}), Weights()
         if out is None:
             known = [name for name in params if name in plus or reconcile.has(g_lr, name) or reconcile.has(g_hr, name)]
             out = {name: empty_for(params[name]) for name in known}
-        conflict: Mapping[str, Number] = {}
-        weights = Weights()
-        if (lambda_hr is not None or λ > 0) and reconcile.common_groups(g_lr, g_hr):
-            products = reconcile.products(g_lr, g_hr)
-            conflict = products.conflict()  # before correction
-            answer = self.reconciled(
-                products, step, lambda: (dense(g_lr, out), dense(g_hr.without_detail(), out)), finite=finite
-            )
-            if isinstance(answer, Weights):
-                weights = answer  # ĝ^HR           Eq. 6, 7, 11
-            else:
-                g_hr = Grads({**answer, **{name: g for name, g in g_hr.items() if name == "detail"}})
         is_finite = reconcile.apply(out, g_lr, g_hr, weights, lambda_hr=λ, plus=plus)  # Eq. 8, 16
+        if finite:
+            require_finite(f"t={t}{'' if step is None else f', view {step.view.name}'}: the merged gradient", out)
         return Merged(Grads(out), conflict, is_finite)
 
     def on_fit_end(self) -> None:
@@ -370,7 +375,7 @@ class Conductor(Hooks):
 def _vjp(
     shot: Shot, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
 ) -> Sequence[Grads]:  # fmt: skip
-    """`Stepper.vjp` for any shot."""
+    """`VJP` for any shot."""
     if weight is None:
         return shot.vjp(cotangents)
     of_shot = getattr(shot, "summed_vjp", None)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from clear_strategies.core.checks import is_color
 from clear_strategies.core.conflicts import Products, Weights
+from clear_strategies.core.deferred import Number
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import Grads, ScreenGradients, Shot
 from clear_strategies.core.step import Losses, Step
@@ -199,6 +200,21 @@ class Hooks:
             refuse(s, "score", f"a tensor [{n}] or None", score)
         require_finite(s, "score", {"S": score})  # a Gaussian whose score is NaN would never grow
         return score
+
+    def answers(
+        self, products: Products | None, both: Callable[[], tuple[Grads, Grads]], params: Mapping[str, Tensor],
+        step: Step | None, t: int, *, finite: bool = False,
+    ) -> tuple[Weights | Grads, Grads, Mapping[str, Number]]:  # fmt: skip
+        """The answers of `reconciled` and `regularized`, and the share of Gaussians in conflict before correction, by group.
+
+        Args:
+            products: of g_LR and g^HR; None: HR takes no part.
+        """
+        if products is None:
+            return Weights(), self.regularized(params, t, finite=finite), {}
+        conflict = products.conflict()
+        answer = self.reconciled(products, step, both, finite=finite)
+        return answer, self.regularized(params, t, finite=finite), conflict
 
     def reconciled(
         self, products: Products, step: Step | None, both: Callable[[], tuple[Grads, Grads]], *, finite: bool = False

@@ -1,10 +1,10 @@
-"""The results of an iteration: the gradients of HR, the merged gradients and the update; and `Stepper`, which applies them."""
+"""The results of an iteration: the gradients of HR, the merged gradients and the update."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 from jaxtyping import Float
 from torch import Tensor
@@ -15,6 +15,9 @@ from clear_strategies.core.gradients import Grads
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import Photo, View
 from rasterizers.guards import unread
+
+VJP = Callable[..., Sequence[Grads]]
+"""The gradients of a rendering's first argument, a `Shot`, as by `Shot.vjp`: of raw parameters, or of what is drawn."""
 
 LossWeights = tuple[float, float] | Tensor
 """λ_HR(t) and λ_HR(t) λ_HF: two numbers, or a tensor of them on the device, [2]."""
@@ -68,10 +71,11 @@ class Update:
 
     Args:
         step: the iteration, for `Conductor.after_step`.
-        grads: the merged gradient by attribute, for the optimizer; None if a `Stepper` has made the step.
+        grads: the merged gradient by attribute, for the optimizer; None before the merge.
         score: S_i, the statistic that densification uses; `ordinary` is that of 3DGS, without strategies. None if no
             densification reads them.
-        conflict: share of Gaussians in conflict before correction, by group and as "gaussian"; empty without HR.
+        conflict: share of Gaussians in conflict before correction, by group and as "gaussian"; empty without HR and before
+            the merge.
         losses: scalars by name.
         cotangents_lr: the gradient of λ_LR L_LR with respect to the LR image, [1, H, W, 3].
 
@@ -85,31 +89,6 @@ class Update:
     conflict: Mapping[str, Number] = field(default_factory=dict)
     losses: Mapping[str, Scalar] = field(default_factory=dict)
     cotangents_lr: Float[Tensor, "1 H W 3"] | None = None
-
-
-@runtime_checkable
-class Stepper(Protocol):
-    """Merges and steps in one pass: the arithmetic of `Conductor.merge` and of the optimizer, without storing the gradient."""
-
-    def vjp(
-        self, shot: Any, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
-    ) -> Sequence[Grads]:  # fmt: skip
-        """One gradient per cotangent; with `weight`, the result of `core.gradients.summed`."""
-        ...
-
-    def step(
-        self, params: Mapping[str, Tensor], shot: Any, g_lr: Grads, hr: HrSide | None, t: int
-    ) -> Mapping[str, Number]:  # fmt: skip
-        """Merge, and step `params` and the optimizer's moments in place; returns the conflict ratios by group.
-
-        Args:
-            shot: one of the renderings that the gradients are of.
-        """
-        ...
-
-    def weights(self, t: int) -> LossWeights:
-        """As `Objective.weights`."""
-        ...
 
 
 def require_finite_parts(where: str, g_lr: Grads, hr: HrSide | None) -> None:
@@ -130,6 +109,7 @@ def guarded(view: View, *, over_changing: bool) -> View:
     Args:
         over_changing: a strategy chooses the background, so transparent images differ between replays.
     """
+
     def layer(x: Any, what: str) -> Any:
         return None if x is None else unread(x, f"the {what} of the view", ("shape", "dtype"))
 

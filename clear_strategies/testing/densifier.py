@@ -54,8 +54,8 @@ def _densified(make: Make, cut: int = 0) -> Iterator[Tensor]:
         update = conductor.update(field.raw(), lr, hr, view, t)
         state.optimizer.step(field.raw(), given.gradient(update))
         if density.collects(t):
-            stepped = replace(update, grads=None)  # as of the compiled step
-            without_error("a densifier's accumulate", f"at t={t}", density.accumulate, stepped, hr, t)
+            before = replace(update, grads=None)  # as from `Conductor.gradients`
+            without_error("a densifier's accumulate", f"at t={t}", density.accumulate, before, hr, t)
         conductor.after_step(field.raw(), update.step)
         state.optimizer.first["opacities"].copy_(torch.arange(1, len(field) + 1))
         if conductor.may_densify(t):

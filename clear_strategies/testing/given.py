@@ -140,5 +140,5 @@ def enlarged(camera: Camera, factor: int) -> Photo:
 
 
 def gradient(update: Update) -> Grads:
-    """The merged gradient, which is there as no `Stepper` is used."""
+    """The merged gradient, which is there after `Conductor.update`."""
     return update.grads or Grads()

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from clear_strategies.core.conflicts import Weights
 from clear_strategies.core.deferred import Number
-from clear_strategies.core.gradients import Colour, Grads, gradients_of
+from clear_strategies.core.gradients import Colour, Grads
 from clear_strategies.kernels import gaussian_step as kernel
 from clear_strategies.kernels import native
 from clear_strategies.kernels.gaussian_step import cpp
@@ -31,6 +31,7 @@ from clear_strategies.merging.iteration import HrSide, LossWeights
 from clear_strategies.training.field import LOG_SCALE_LIMIT, LOGIT_LIMIT, Activation, FieldShot
 from clear_strategies.training.optim import BETA1, BETA2, Adam
 from rasterizers.interface import BackendUnavailable
+from rasterizers.modes import apart_from_the_loop
 from rasterizers.recording import running
 from rasterizers.warp_runtime import require_warp
 
@@ -83,7 +84,7 @@ def gaussian_pass(optimizer: Adam) -> GaussianPass:
 
 
 class CompiledStep:
-    """A `Stepper`: merges as `Conductor.merge` does, steps as `Adam.step` does, and constrains the parameters.
+    """Merges as `Conductor.merge` does, steps as `Adam.step` does, and constrains the parameters, in one pass.
 
     It skips rows whose gradient and both moments are 0, and bands of the spherical harmonics above the active degree.
 
@@ -105,29 +106,22 @@ class CompiledStep:
         self._numbers: Tensor | None = None  # on the device: `count` writes them before each replay of a recording
         self.bands, self._restored = 0, -1  # see `_find_bands`; `Adam.restored`, then
 
-    def vjp(
-        self, shot: FieldShot, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
-    ) -> list[Grads]:  # fmt: skip
-        return gradients_of(shot.gradients(cotangents, weight))
-
+    @apart_from_the_loop
     def step(
         self, params: Mapping[str, Tensor], shot: FieldShot, g_lr: Grads, hr: HrSide | None, t: int
     ) -> Mapping[str, Number]:
-        """Step `params` and the optimizer's moments in place; returns the conflict ratios by group."""
+        """Step `params` and the optimizer's moments in place; returns the conflict ratios by group.
+
+        Args:
+            shot: one of the renderings that the gradients are of, by `FieldShot.gradients`.
+        """
         gaussians, λ = self._gaussians(shot.activation, g_lr, hr), self.conductor.objective.lambda_hr(t)
-        weights, corrected, conflict = Weights(), Grads(), dict[str, Number]()
-        if hr is not None and λ > 0:
-            products = gaussians.products()
-            conflict = products.conflict()  # before correction
-            both = partial(_both_dense, shot.activation, g_lr, hr.g)
-            answer = self.conductor.reconciled(products, hr.step, both, finite=True)
-            if isinstance(answer, Weights):
-                weights = answer  # ĝ^HR           Eq. 6, 7, 11
-            else:
-                weights, corrected = Weights(keep=0.0), answer
-        plus = self.conductor.regularized(params, t, finite=True)
+        products = gaussians.products() if hr is not None and λ > 0 else None
+        both = partial(_both_dense, shot.activation, g_lr, Grads() if hr is None else hr.g)
+        step = None if hr is None else hr.step
+        weights, plus, conflict = self.conductor.answers(products, both, params, step, t, finite=True)  # Eq. 6, 7, 11
         decays = (hr is not None and hr.detail is not None) or "detail" in plus
-        self._apply(gaussians, params, g_lr, t, weights, corrected, plus, decays=decays)
+        self._apply(gaussians, params, g_lr, t, weights, plus, decays=decays)
         return conflict
 
     def count(self, t: int) -> None:
@@ -148,7 +142,7 @@ class CompiledStep:
 
     def step_extra(self, params: Mapping[str, Tensor], shot: FieldShot, g_lr: Grads, t: int) -> None:
         """Step on this gradient alone: nothing is regularized."""
-        self._apply(self._gaussians(shot.activation, g_lr, None), params, g_lr, t, Weights(), {}, {}, decays=False)
+        self._apply(self._gaussians(shot.activation, g_lr, None), params, g_lr, t, Weights(), Grads(), decays=False)
 
     def _apply(
         self,
@@ -156,17 +150,17 @@ class CompiledStep:
         params: Mapping[str, Tensor],
         g_lr: Grads,
         t: int,
-        weights: Weights,
-        corrected: Mapping[str, Tensor],
-        plus: Mapping[str, Tensor],
+        weights: Weights | Grads,
+        plus: Grads,
         *,
         decays: bool,
     ) -> None:
         """Merge and step.
 
         Args:
-            corrected: ĝ_HR, if a strategy overrides `correct`. decays: f_det decays.
+            weights: or ĝ_HR, if a strategy overrides `correct`. decays: f_det decays.
         """
+        weights, corrected = (weights, Grads()) if isinstance(weights, Weights) else (Weights(keep=0.0), weights)
         numbers = None if running() is None else self._numbers
         rates, bias2 = self.optimizer.advance() if numbers is None else ({}, 1.0)
         keep = 1 - self.optimizer.rates.detail_decay if decays else 1.0

@@ -20,7 +20,7 @@ from clear_strategies.kernels.per_gaussian import reference
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.training.mip import NEAR, filter_std
 from rasterizers.geometry import constant_band
-from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, summed_vjp
+from rasterizers.interface import Camera, Rasterizer, Rendering, Splats, summed_vjp
 
 _INITIAL_OPACITY: Final = 0.1
 _NEIGHBOURS: Final = 3  # 3DGS: a point's initial size is the root mean square distance to its 3 nearest neighbours
@@ -211,12 +211,12 @@ class FieldShot:
 
     def gradients(
         self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
-    ) -> SplatGradients:  # fmt: skip
-        """The gradients of the rendered splats, before the chain rule of `activation`; see `rasterizers.interface.summed_vjp`."""
-        return summed_vjp(self._rendering, cotangents, weight)
+    ) -> list[Grads]:  # fmt: skip
+        """As `vjp`, of the rendered splats: before the chain rule of `activation`, with the colours' gradient as factors."""
+        return gradients_of(summed_vjp(self._rendering, cotangents, weight))
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
-        each = gradients_of(self.gradients(cotangents))
+        each = self.gradients(cotangents)
         raw = [*map(self.activation.vjp, each)]
         if self._detail:
             for g, drawn in zip(raw, each, strict=True):
@@ -225,7 +225,7 @@ class FieldShot:
 
     def summed_vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]) -> list[Grads]:
         """The result of `core.gradients.summed`, which is summed before the projection's VJP."""
-        *each, hf = gradients_of(self.gradients(cotangents, weight))
+        *each, hf = self.gradients(cotangents, weight)
         return [*map(self.activation.vjp, each), hf if self._detail else Grads(screen=hf.screen)]
 
 

@@ -18,19 +18,21 @@ from clear_strategies import files
 from clear_strategies.core import deferred, images
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite
-from clear_strategies.core.gradients import conflict_columns
+from clear_strategies.core.gradients import Grads, conflict_columns
 from clear_strategies.core.seeds import generator_at
+from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.data.priors import Bicubic, network_of
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import AnswerError, DivergedError
-from clear_strategies.merging.iteration import Update, require_finite_parts
+from clear_strategies.merging.iteration import require_finite_parts
 from clear_strategies.merging.logs import computed
 from clear_strategies.merging.skips import PLATEAU_LOSS
 from clear_strategies.signals import Interrupted, deferred_signals, foremost
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
+from clear_strategies.training.field import FieldShot
 from clear_strategies.training.replayed_iteration import ExtraViewInputs, ViewInputs, replayed, replays_for
 from clear_strategies.training.state import TrainState
 from rasterizers import native
@@ -49,10 +51,10 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
     hr_due = conductor.wants_hr(t, scored=s.density.collects(t))
     scales = {"lr": conductor.lr_due(view, hr_due), "hr": hr_due}
     z, background = conductor.gate(t, len(θ)), conductor.background(t)  # zᵗ             Eq. 15       SVS
-    u, row = learn(s, rasterizer, ViewInputs(t, view, scales, z, background))
+    step, row = learn(s, rasterizer, ViewInputs(t, view, scales, z, background))
     conductor.draw(t, θ.means.data, partial(enlarged, s, rasterizer, background))
     extra = extra_steps(s, rasterizer, conductor.extra_views(t), background)
-    conductor.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
+    conductor.after_step(θ.raw(), step)  # θᵃ at t = t_a  Eq. 16       SVS
     with stage("density and filter"):
         # clone · split · prune = parents[M]
         restructured = conductor.may_densify(t) and s.restructure()
@@ -67,7 +69,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
 
 
 @replayed
-def learn(s: TrainState, rasterizer: Rasterizer, inputs: ViewInputs) -> tuple[Update, dict[str, Number]]:
+def learn(s: TrainState, rasterizer: Rasterizer, inputs: ViewInputs) -> tuple[Step, dict[str, Number]]:
     """What an iteration does with its view: render, compare, step on the merged gradient, and accumulate statistics.
 
     Nothing here may read a number from the device, see `replayed`.
@@ -77,21 +79,29 @@ def learn(s: TrainState, rasterizer: Rasterizer, inputs: ViewInputs) -> tuple[Up
         lr, hr = θ.render_scales(  # Î_LR, Î_HR     Eq. 2, 3
             over(rasterizer, inputs.background), view, gate=inputs.gate, **inputs.scales
         )
-    params = θ.raw()
-    scored = s.density.collects(t)
-    u = conductor.update(params, lr, hr, view, t, s.compiled_step, scored=scored, looked_up=inputs.looked_up)
-    if u.grads is not None:  # otherwise the compiled step has updated the parameters
-        with stage("optimizer"):
-            s.optimizer.step(params, u.grads)
-            θ.constrain()
+    params, step, scored = θ.raw(), s.compiled_step, s.density.collects(t)
     *_, finest = (shot for shot in (lr, hr) if shot is not None)
+    g_lr, from_hr, u = conductor.gradients(
+        params, lr, hr, view, t, None if step is None else FieldShot.gradients, scored=scored,
+        weights=None if step is None else step.weights(t), looked_up=inputs.looked_up,
+    )  # fmt: skip
+    if step is None:
+        with stage("strategies"):
+            g_hr = Grads() if from_hr is None else from_hr.routed
+            grads, conflict, _ = conductor.merge(params, g_lr, g_hr, u.step, t, finite=True)
+        with stage("optimizer"):
+            s.optimizer.step(params, grads)
+            θ.constrain()
+    else:
+        with stage("per-Gaussian pass"):  # the same in one
+            conflict = step.step(params, finest, g_lr, from_hr, t)
     if scored:
         s.density.accumulate(u, finest, t)  # S^dens         Eq. 14
     low = images.area_mean(finest.image, view.factor) if lr is None else lr.image
     photo = view.lr.over(inputs.background, view.background)
     row: dict[str, Number] = {"psnr_train_lr": psnr_of(low, photo.image, photo.shown)}
     row |= {f"loss_{name}": value for name, value in u.losses.items()}
-    return u, row | conflict_columns(u.conflict)
+    return u.step, row | conflict_columns(conflict)
 
 
 def view_at(s: TrainState) -> View:
@@ -145,7 +155,7 @@ def learn_extra(s: TrainState, rasterizer: Rasterizer, inputs: ExtraViewInputs) 
         shot = θ.shot(over(rasterizer, inputs.background), extra.photo.camera)
         losses = s.conductor.extra_loss(shot.image, extra, inputs.t)
         if s.compiled_step is not None:
-            (g,) = s.compiled_step.vjp(shot, losses.cotangents)
+            (g,) = shot.gradients(losses.cotangents)
             require_finite_parts(where, g, None)
             s.compiled_step.step_extra(θ.raw(), shot, g, inputs.t)
         else:

@@ -18,10 +18,10 @@ from typing import Any, TypeVar, cast
 from torch import Tensor
 
 from clear_strategies.core.deferred import Number
+from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.kernels import native
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.merging.iteration import Update
 from clear_strategies.merging.replay import LoggedReplay, logged_replays, merging_strategies, why_not_recordable
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.compiled_step import CompiledStep
@@ -31,8 +31,8 @@ from rasterizers.replays import Given, ReplayKey, Replays, shapes_of
 
 _log = logging.getLogger(__name__)
 
-L = TypeVar("L", bound=tuple[Update | None, dict[str, Number]])
-"""The update, None for an extra view, and columns of the history."""
+L = TypeVar("L", bound=tuple[Step | None, dict[str, Number]])
+"""The step as strategies see it, None for an extra view, and columns of the history."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,7 +139,7 @@ def replayed(learn: Callable[[TrainState, Rasterizer, Inputs], L]) -> Callable[[
         background = cast(Recordable, over(rasterizer, inputs.background)).background_on(s.device)
         given = background, *inputs.given(s.conductor)
 
-        def live() -> tuple[Update | None, dict[str, Number]]:
+        def live() -> tuple[Step | None, dict[str, Number]]:
             s.optimizer.steps = steps  # a failed recording or replay has counted one
             return learn(s, rasterizer, inputs)
 
@@ -147,18 +147,18 @@ def replayed(learn: Callable[[TrainState, Rasterizer, Inputs], L]) -> Callable[[
             background, *others = copies
             return learn(s, drawn_by.over_changing(background), inputs.reading(others))
 
-        def record() -> LoggedReplay[Update | None]:
+        def record() -> LoggedReplay[Step | None]:
             return LoggedReplay(
                 s.device, s.conductor, recorded, given, inputs.t, calls=inputs.calls(s.conductor),
                 numbers_of=partial(drawn_by.numbers_of, device=s.device), count=cast(CompiledStep, s.compiled_step).count,
             )  # fmt: skip
 
-        update, row = s.replays.do(_key(s, inputs, given), inputs.t, given, live=live, record=record)
-        if update is not None:
+        step, row = s.replays.do(_key(s, inputs, given), inputs.t, given, live=live, record=record)
+        if step is not None:
             view: Any = inputs.view
             # A strategy may store tensors of the step, which the next replay overwrites.
-            update = replace(update, step=replace(update.step.copied(), t=inputs.t, view=view))
-        return cast(L, (update, row))
+            step = replace(step.copied(), t=inputs.t, view=view)
+        return cast(L, (step, row))
 
     return learned
 
