@@ -137,8 +137,8 @@ class AutogradShot:
         """`slot`, or `means2d` as one."""
         return self.slot or ScreenGradientSlot(self.means2d, (self.image.shape[1], self.image.shape[0]))
 
-    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
-        """∇θ of every cotangent, each with `.screen`; the graph is kept. Frozen parameters have gradient 0."""
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None) -> list[Grads]:
+        """See `Shot`; the graph is kept. Frozen parameters have gradient 0."""
         results = []
         for g in self.gradients(cotangents):
             raw, _ = to_leaves(g, self.edges, self.params)
@@ -146,14 +146,12 @@ class AutogradShot:
             if "detail" in self.params and detail is not None:
                 raw["detail"] = detail
             results.append(Grads(every_number(raw, self.params), screen=g.screen))
-        return results
+        return results if weight is None else summed(results, weight)
 
     def gradients(
         self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
     ) -> list[Grads]:  # fmt: skip
-        """The first part for every cotangent, by the names of `drawn`; for this package's rasterizers the colours' gradient is
-        factors. With `weight`, the result of `core.gradients.summed`.
-        """
+        """The first part of `vjp`, by the names of `drawn`; for this package's rasterizers the colours' gradient is factors."""
         if self.drawing is not None:
             drawn = gradients_of(summed_vjp(self.drawing.rendering, self._at_drawing(cotangents), weight))
             if weight is not None and (colour := drawn[0].colour) is not None:

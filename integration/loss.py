@@ -214,12 +214,10 @@ class _HrShot:
         self.image, self.means2d, self.visible, self._shot = shot.image, shot.means2d, shot.visible, shot
         self.of_others: OfOthers = []
 
-    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None) -> list[Grads]:
         """See `Shot`."""
-        return [self._to_leaves(g) for g in self._shot.gradients(cotangents)]
-
-    def summed_vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]) -> list[Grads]:
-        """See `core.gradients.summed`."""
+        if weight is None:
+            return [self._to_leaves(g) for g in self._shot.gradients(cotangents)]
         *each, of_hf = self._shot.gradients(cotangents, weight)
         detail = {name: g for name, g in of_hf.items() if name in self._shot.params}
         return [*map(self._to_leaves, each), Grads(detail, screen=of_hf.screen)]

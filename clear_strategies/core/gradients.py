@@ -139,8 +139,12 @@ class Shot(Protocol):
     @property
     def visible(self) -> Bool[Tensor, " N"]: ...
 
-    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
-        """∇θ of Σ cotangent·image on the raw parameters, one per cotangent, each with `.screen`."""
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None) -> list[Grads]:
+        """∇θ of Σ cotangent·image on the raw parameters, one per cotangent, each with `.screen`.
+
+        Args:
+            weight: the last two are summed by it, see `summed`; None: nothing is.
+        """
         ...
 
 

@@ -1,6 +1,6 @@
 """The conductor: the merged gradient of a view, from its two renderings and the answers of the strategies.  Eq. 8, 13
 
-It is the same in every trainer. The order of an iteration is that of `Conductor.update`.
+It is the same in every trainer. The order of an iteration is that of `Conductor.gradients`, then of `Conductor.merge`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.core.conflicts import Weights
 from clear_strategies.core.finite import require_finite, require_finite_losses
-from clear_strategies.core.gradients import Grads, ScreenGradients, Shot, screen_norm, screen_of, summed, to_ndc
+from clear_strategies.core.gradients import Grads, ScreenGradients, Shot, screen_norm, screen_of, to_ndc
 from clear_strategies.core.step import Losses, Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.core.work_log import WorkLog
@@ -372,14 +372,8 @@ class Conductor(Hooks):
         return photo if is_final else photo.over(self.background(t), background)
 
 
-def _vjp(
-    shot: Shot, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
-) -> Sequence[Grads]:  # fmt: skip
-    """`VJP` for any shot."""
-    if weight is None:
-        return shot.vjp(cotangents)
-    of_shot = getattr(shot, "summed_vjp", None)
-    return summed(shot.vjp(cotangents), weight) if of_shot is None else of_shot(cotangents, weight)
+def _vjp(shot: Shot, *given: Tensor) -> Sequence[Grads]:
+    return shot.vjp(*given)
 
 
 def _require_size(view: View, scale: Scale, render: Tensor) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.evidence import Evidence
-from clear_strategies.core.gradients import ATTRIBUTES, Grads
+from clear_strategies.core.gradients import ATTRIBUTES, Grads, summed
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import Photo, View
 from clear_strategies.errors import AnswerError
@@ -40,8 +40,9 @@ class StubShot:
     visible: Bool[Tensor, " N"]
     gradients: list[Grads]
 
-    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
-        return self.gradients[: len(cotangents)]
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None) -> list[Grads]:
+        each = self.gradients[: len(cotangents)]
+        return each if weight is None else summed(each, weight)
 
 
 def random_params(n: int, g: torch.Generator) -> dict[str, Tensor]:

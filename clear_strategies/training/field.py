@@ -215,18 +215,17 @@ class FieldShot:
         """As `vjp`, of the rendered splats: before the chain rule of `activation`, with the colours' gradient as factors."""
         return gradients_of(summed_vjp(self._rendering, cotangents, weight))
 
-    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
-        each = self.gradients(cotangents)
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None) -> list[Grads]:
+        """See `Shot`; the sum is taken before the projection's VJP."""
+        each = self.gradients(cotangents, weight)
+        if weight is not None:
+            *each, hf = each
+            return [*map(self.activation.vjp, each), hf if self._detail else Grads(screen=hf.screen)]
         raw = [*map(self.activation.vjp, each)]
         if self._detail:
             for g, drawn in zip(raw, each, strict=True):
                 g["detail"] = drawn.tensors["rgb"]
         return raw
-
-    def summed_vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]) -> list[Grads]:
-        """The result of `core.gradients.summed`, which is summed before the projection's VJP."""
-        *each, hf = self.gradients(cotangents, weight)
-        return [*map(self.activation.vjp, each), hf if self._detail else Grads(screen=hf.screen)]
 
 
 def _neighbour_distance(means: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
