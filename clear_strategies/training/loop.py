@@ -6,8 +6,8 @@ functions of (seed, t), so a resumed run has the same bits as one that was never
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Final
@@ -227,24 +227,10 @@ def fit(
     before = state.t - 1
     with deferred_signals() as pending, kernel_threads(state, rasterizer), files.Beside() as beside:
         while not state.ended:
-            done, steps = state.t, state.optimizer.steps
+            done = state.t
             beside.finish(waits=False)
-            try:
+            with _explained(state, None if checkpoints is None else save):
                 iterate(state, rasterizer)
-            except Exception as error:
-                where = ""
-                if checkpoints is not None and state.optimizer.steps != steps:
-                    where = " Its step was made, so that its state is not saved."
-                elif checkpoints is not None:
-                    with suppress(Exception):  # the first error is reported
-                        where = f" The state before that step is {save()}; fit.resume goes on from it."
-                if isinstance(error, AnswerError):
-                    raise AnswerError(f"t={done}: {error}{where}") from error
-                if isinstance(error, DivergedError):
-                    remedy = "Check that view's photos, or lower the learning rates."
-                    raise DivergedError(f"{error}{where} {remedy}") from error
-                error.add_note(f"This was in iteration t={done}.{where}")  # e.g. of a strategy's own code
-                raise
             ended = state.ended
             state.history[-1].update(clock.read())
             if settings.probe_every and (_passed(settings.probe_every, before, done) or ended):
@@ -263,6 +249,31 @@ def fit(
     state.replays = None  # recordings keep the memory of iterations, which evaluation and pictures need
     state.history_as_floats()
     return state
+
+
+@contextmanager
+def _explained(state: TrainState, save: Callable[[], Path | None] | None) -> Iterator[None]:
+    """A scope of one iteration, whose errors also say which iteration it was, and where the state before it is saved.
+
+    Args:
+        save: saves the state; None: nothing is saved.
+    """
+    t, steps, where = state.t, state.optimizer.steps, ""
+    try:
+        yield
+    except Exception as error:
+        if save is not None and state.optimizer.steps != steps:
+            where = " Its step was made, so that its state is not saved."
+        elif save is not None:
+            with suppress(Exception):  # the first error is reported
+                where = f" The state before that step is {save()}; fit.resume goes on from it."
+        if isinstance(error, AnswerError):
+            raise AnswerError(f"t={t}: {error}{where}") from error
+        if isinstance(error, DivergedError):
+            remedy = "Check that view's photos, or lower the learning rates."
+            raise DivergedError(f"{error}{where} {remedy}") from error
+        error.add_note(f"This was in iteration t={t}.{where}")  # e.g. of a strategy's own code
+        raise
 
 
 def _passed(every: int, before: int, t: int) -> bool:
