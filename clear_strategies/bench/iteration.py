@@ -73,7 +73,7 @@ class Training:
         field, device = field_of(workload.splats), workload.splats.means.device
         conductor = Conductor(GCO(), P2G(), *([SVS()] if dropout else []), objective=objective)
         # Statistics are accumulated, although no densification follows.
-        density = Density(DensitySettings(stop=10_000), len(field), extent=1.0, seed=0, device=device)
+        density = Density(DensitySettings(stop=10_000), field, (view,), seed=0)
         conductor.on_fit_start(1, 0, device)
         optimizer = Adam(field.raw(), FROZEN, 1.0)
         self.state = TrainState(

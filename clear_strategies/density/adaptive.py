@@ -88,39 +88,23 @@ class DensitySettings:
         return max(1, min(self.every, (self.stop - self.start) // _FEWEST_ROUNDS))
 
     def densifier(self, field: GaussianField, views: Sequence[View], seed: int) -> Density:
-        return Density.of(self, field, views, seed)
+        return Density(self, field, views, seed)
 
 
 class Density(Densifier):
-    """Accumulates statistics per Gaussian, and clones, splits and prunes Gaussians by them.
+    """Accumulates statistics per Gaussian of a field that trains on the views, and clones, splits and prunes Gaussians by them.
 
-    Args:
+    Attributes:
         extent: 3DGS's cameras_extent, world units. white_background: adds the early opacity reset.
-        device: that of the field.
     """
 
     name = "density control"
 
-    def __init__(
-        self,
-        settings: DensitySettings,
-        n: int,
-        *,
-        extent: float,
-        seed: int,
-        white_background: bool = False,
-        device: torch.device | str = "cpu",
-    ) -> None:
+    def __init__(self, settings: DensitySettings, field: GaussianField, views: Sequence[View], seed: int) -> None:
         self.settings: DensitySettings = settings
-        self.extent, self.seed, self.white_background = extent, seed, white_background
-        self.score, self.ordinary, self.count = (torch.zeros(n, device=device) for _ in range(3))
-        self.cap, self._warned_of_cap = settings.max_gaussians, False
-
-    @classmethod
-    def of(cls, settings: DensitySettings, field: GaussianField, views: Sequence[View], seed: int) -> Density:
-        """For the training of a field on these views."""
-        extent, white = cameras_extent(views), all(c == 1.0 for c in views[0].background)
-        return cls(settings, len(field), extent=extent, seed=seed, white_background=white, device=field.means.device)
+        self.extent, self.white_background = cameras_extent(views), all(c == 1.0 for c in views[0].background)
+        self.score, self.ordinary, self.count = (torch.zeros(len(field), device=field.means.device) for _ in range(3))
+        self.seed, self.cap, self._warned_of_cap = seed, settings.max_gaussians, False
 
     def collects(self, t: int) -> bool:
         return self.settings.statistics_from < t < self.settings.stop

@@ -46,7 +46,7 @@ class ShuffleSettings(DensitySettings):
         require_number("split_above", self.split_above, below=1)
 
     def densifier(self, field: GaussianField, views: Sequence[View], seed: int) -> Density:
-        return ShuffleSplit.of(self, field, views, seed)
+        return ShuffleSplit(self, field, views, seed)
 
 
 class ShuffleSplit(Density):

@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from clear_strategies.core.conflicts import Products
 from clear_strategies.core.points import PointCloud
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
+from clear_strategies.training.field import GaussianField
 from clear_strategies.training.mip import NEAR, MipFilter
 from clear_strategies.training.optim import LearningRates
 from clear_strategies.training.settings import FitSettings
@@ -102,6 +104,14 @@ class ShowsDark(Strategy):
 
     def extra_views(self, t: int) -> Sequence[ExtraView]:
         return (self.cache["extra"],)
+
+
+def densifier(settings: DensitySettings, field: GaussianField | int) -> Any:
+    """Density control in a scene of extent 1, of a field or of one with so many Gaussians."""
+    field = GaussianField.from_cloud(cloud(field)) if isinstance(field, int) else field
+    made = settings.densifier(field, [step().view], 0)
+    made.extent = 1.0
+    return made
 
 
 class Operations(TorchDispatchMode):

@@ -10,7 +10,7 @@ from clear_strategies.core import deferred
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import Grads, to_ndc
 from clear_strategies.core.step import Step
-from clear_strategies.density.adaptive import Density, DensitySettings
+from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.kernels import native
 from clear_strategies.kernels.per_gaussian import activate, evidence_score, reference, route, wander
 from clear_strategies.merging.iteration import HrSide, Update
@@ -129,7 +129,7 @@ def test_scores_and_their_sum(lanes, score_by, hf):
         score, ordinary = conductor.scores(to_ndc(lr.screen, (24, 16)), hr, (0.7, 0.14))
         found = [score, ordinary]
         for reduce in ("mean", "max"):
-            density = Density(DensitySettings(reduce=reduce), N, extent=1, seed=0)
+            density = toy.densifier(DensitySettings(reduce=reduce), N)
             for factor in (1.0, 0.3):
                 density.accumulate(
                     Update(hr.step, None, factor * score, factor * ordinary), Seen(lr.screen, visible), 1

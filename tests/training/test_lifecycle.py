@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from clear_strategies import SVS, Conductor, Grads, Photo, Strategy, Update
 from clear_strategies.core import deferred
 from clear_strategies.core.points import PointCloud
-from clear_strategies.density.adaptive import Density, DensitySettings
+from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.errors import AnswerError, DensityError, DivergedError
 from clear_strategies.schedules import scaled
 from clear_strategies.testing import StubShot
@@ -37,7 +37,7 @@ def tagged(n=12):
     optimizer = Adam(field.raw(), LearningRates(), extent=1.0)
     for moments in (optimizer.first, optimizer.second):
         moments["detail"][:] = number[:, None] + 0.5
-    density = Density(DensitySettings(start=0, stop=100, statistics_from=0, min_gaussians=1), n, extent=1.0, seed=0)
+    density = toy.densifier(DensitySettings(start=0, stop=100, statistics_from=0, min_gaussians=1), field)
     return field, optimizer, density
 
 
@@ -125,7 +125,7 @@ def test_split_children_lie_along_the_long_axis_of_their_parent():
 
 def test_the_cap_binds_and_is_said(caplog):
     field, optimizer, _ = tagged()
-    density = Density(DensitySettings(start=0, stop=100, max_gaussians=14), 12, extent=1.0, seed=0)
+    density = toy.densifier(DensitySettings(start=0, stop=100, max_gaussians=14), field)
     density.score[:] = density.ordinary[:] = torch.arange(12) + 1.0
     density.count[:] = 1
     assert len(density.restructure(field, optimizer, 10)) == 14
@@ -133,7 +133,7 @@ def test_the_cap_binds_and_is_said(caplog):
 
 
 def test_statistics_are_means_over_the_views_that_saw_a_gaussian_and_at_least_ten_rounds_fit():
-    density = Density(DensitySettings(start=0, stop=100, statistics_from=0), 3, extent=1.0, seed=0)
+    density = toy.densifier(DensitySettings(start=0, stop=100, statistics_from=0), 3)
 
     seen = StubShot(torch.zeros(2, 2, 3), torch.zeros(3, 2), torch.tensor([True, True, False]), [])
     for value in (1.0, 3.0):
@@ -145,7 +145,7 @@ def test_statistics_are_means_over_the_views_that_saw_a_gaussian_and_at_least_te
     assert density.count.tolist() == [3, 2, 0]
     settings = DensitySettings(start=50, stop=500)
     assert settings.interval == 45
-    density = Density(settings, 1, extent=1.0, seed=0)
+    density = toy.densifier(settings, 1)
     assert [t for t in range(1, 600) if density.due(t)] == list(range(90, 500, 45))
     assert DensitySettings().interval == 100
 

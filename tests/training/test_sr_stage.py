@@ -8,7 +8,7 @@ import torch
 
 from clear_strategies import Conductor, ExtraView, Objective, Photo, SRStage, Strategy
 from clear_strategies.core import images
-from clear_strategies.density.shuffle import ShuffleSettings, ShuffleSplit
+from clear_strategies.density.shuffle import ShuffleSettings
 from clear_strategies.outputs import results
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.loop import EXTRA_LOSS, iterate
@@ -30,7 +30,7 @@ def field_of(opacities: list[float]) -> tuple[GaussianField, Adam]:
 
 def test_an_opaque_gaussian_becomes_six_thinner_ones_once_and_the_cap_leaves_the_most_opaque():
     theta, optimizer = field_of([0.3, 0.84, 0.4])
-    density, parents = ShuffleSplit(AT_10, 3, extent=1.0, seed=0), []
+    density, parents = toy.densifier(AT_10, theta), []
     before = theta.means.data.clone()
     assert [density.step(theta, optimizer, t, parents.append) for t in (9, 10, 11)] == [False, True, False]
     assert parents[0].tolist() == [0, 2, *[1] * 6]
@@ -43,10 +43,10 @@ def test_an_opaque_gaussian_becomes_six_thinner_ones_once_and_the_cap_leaves_the
     assert density.second_stage == 11
     theta, optimizer = field_of([0.6, 0.7, 0.9, 0.8])
     settings = ShuffleSettings(start=20, stop=20, split_at=10, min_gaussians=1, max_gaussians=14)
-    density, parents = ShuffleSplit(settings, 4, extent=1.0, seed=0), []
+    density, parents = toy.densifier(settings, theta), []
     density.step(theta, optimizer, 12, parents.append)  # skips may jump over t=10
     assert parents[0].tolist() == [0, 1, *[2, 3] * 6]
-    resumed = ShuffleSplit(settings, 14, extent=1.0, seed=0)
+    resumed = toy.densifier(settings, theta)
     resumed.load_state_dict(density.state_dict())
     assert not resumed.step(theta, optimizer, 13, parents.append)
 
@@ -138,5 +138,5 @@ def test_hidden_pixels_do_not_decide_how_far_a_robust_picture_is_trusted():
 def test_timing_has_iterations_and_seconds_of_both_stages():
     state, history = start(()), pd.DataFrame({"t": range(1, 6), "seconds": [2.0, 4.0, 6.0, 8.0, 10.0]})
     assert results._two_stages(state, history) == []
-    state.t, state.density = 6, ShuffleSplit(replace(AT_10, split_at=2), 3, extent=1.0, seed=0)
+    state.t, state.density = 6, toy.densifier(replace(AT_10, split_at=2), 3)
     assert [(row["runs"], row["seconds"]) for row in results._two_stages(state, history)] == [(2, 4.0), (3, 6.0)]
