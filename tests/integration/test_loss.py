@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from clear_strategies import GCO, P2G, SVS, Conductor, Strategy
+from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.core.step import Step
 from clear_strategies.training.field import GaussianField
 from integration import AutogradShot, HostError, ScoreScaler, extra_loss, graph, joint_loss
@@ -28,14 +29,24 @@ class Host:
             rows.add_(torch.randn(rows.shape, generator=g), alpha=0.5)
         self.params = {name: value.clone().requires_grad_() for name, value in self.field.raw().items()}
 
+    def activated(self, **computed):
+        """What a rasterizer is given: the activated parameters, and what is computed of them in their place."""
+        p = self.params
+        return p | {"scales": p["scales"].exp(), "opacities": p["opacities"].sigmoid()} | computed
+
+    def draw(self, camera, offset=None, centres=None, **computed):
+        """A shot with this offset of the colours."""
+        drawn = self.activated(**computed)
+        shot = autograd.draw(toy.RASTERIZER, Splats(*map(drawn.get, PARAMETERS), offset), camera, centres)
+        return AutogradShot(shot.image, shot.means2d, shot.visible, self.params)
+
     def render(self, camera, z=None, detail=True):
         p = self.params
-        opacities = p["opacities"].sigmoid() if z is None else p["opacities"].sigmoid() * z
-        offset = p["detail"] if detail else torch.zeros_like(p["detail"])
-        splats = Splats(p["means"], p["quats"], p["scales"].exp(), opacities, p["sh0"], p["shN"], offset)
-        shot = autograd.draw(toy.RASTERIZER, splats, camera)
-        params = p if detail else {name: value for name, value in p.items() if name != "detail"}
-        return AutogradShot(shot.image, shot.means2d, shot.visible, params)
+        gated = {} if z is None else {"opacities": p["opacities"].sigmoid() * z}
+        if detail:
+            return self.draw(camera, p["detail"], **gated)
+        params = {name: value for name, value in p.items() if name != "detail"}
+        return replace(self.draw(camera, torch.zeros_like(p["detail"]), **gated), params=params)
 
 
 def drawn(*strategies):
@@ -43,6 +54,21 @@ def drawn(*strategies):
     host, view = Host(scene := toy.scene(20)), scene.train[0]
     conductor = Conductor(*strategies, objective=HR_FROM_START)
     return host, conductor, view, host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
+
+
+def cotangents(objective, lr, hr, view, share=1.0):
+    """Of the losses of LR, of HR and of HR's high frequencies, which compare this share of the brightness."""
+    (of_lr,) = share * objective.lr(share * lr.image.detach(), view.lr.image, None).cotangents
+    base, hf = share * objective.hr(share * hr.image.detach(), view.hr.image, None).cotangents
+    return of_lr, base, hf
+
+
+def gradients(objective, lr, hr, view, *leaves):
+    """Of the whole loss at t = 5, without routing."""
+    of_lr, base, hf = cotangents(objective, lr, hr, view)
+    of_hr = objective.lambda_hr(5) * (base + objective.lambda_hf * hf)
+    of_scales = torch.autograd.grad(lr.image, leaves, of_lr), torch.autograd.grad(hr.image, leaves, of_hr)
+    return [g_lr + g_hr for g_lr, g_hr in zip(*of_scales, strict=True)]
 
 
 @pytest.mark.parametrize("strategies", [(), (GCO(),), (P2G(),), (SVS(),), (GCO(), P2G(), SVS())], ids=len)
@@ -136,20 +162,19 @@ def test_what_else_the_loop_trains_gets_its_gradient(share, strategies, hooked):
     exposure, offset = torch.eye(3).requires_grad_(), torch.zeros(1, 1, 3, requires_grad=True)
 
     def render(camera, detail=None):
-        p = host.params | {"sh0": host.params["sh0"] + offset}
+        sh0 = host.params["sh0"] + offset
         if hooked:
-            p["sh0"].register_hook(lambda g: 3 * g)
-        splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"], detail)
-        shot = autograd.draw(toy.RASTERIZER, splats, camera)
-        return AutogradShot(shot.image @ exposure, shot.means2d, shot.visible, host.params)
+            sh0.register_hook(lambda g: 3 * g)
+        shot = host.draw(camera, detail, sh0=sh0)
+        return replace(shot, image=shot.image @ exposure)
 
     lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
     joint, _ = joint_loss(conductor, host.params, lr, hr, view, 5)
     (3 * joint).backward()
     objective, m = conductor.objective, conductor.hr_gradients(hr, Step(5, view)).m
-    (cotangent,) = share * objective.lr(share * lr.image.detach(), view.lr.image, None).cotangents
-    of_exposure, of_offset = torch.autograd.grad(lr.image, (exposure, offset), cotangent)
-    base, hf = hr.vjp(share * objective.hr(share * hr.image.detach(), view.hr.image, None).cotangents)
+    of_lr, *of_hr = cotangents(objective, lr, hr, view, share)
+    of_exposure, of_offset = torch.autograd.grad(lr.image, (exposure, offset), of_lr)
+    base, hf = hr.vjp(torch.stack(of_hr))
     routed = base["sh0"] + objective.lambda_hf * torch.as_tensor(m).view(-1, 1, 1) * hf["sh0"]
     of_offset = of_offset + objective.lambda_hr(5) * routed.sum(0, keepdim=True)
     for leaf, expected in ((exposure, of_exposure), (offset, of_offset)):
@@ -204,12 +229,10 @@ def test_what_reaches_the_colours_and_the_rasterizer_counts_once(found):
         if found == "in torch":
             image, centres = sum_of_blobs(p, sh0, camera)
             return AutogradShot(image, centres, torch.ones(20, dtype=torch.bool), p)
-        splats = Splats(centres, p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), sh0, p["shN"], detail)
-        shot = autograd.draw(toy.RASTERIZER, splats, camera)
+        drawn = host.activated(means=centres, sh0=sh0)
+        shot = host.draw(camera, detail, **drawn)
         slot = ScreenGradientSlot(shot.means2d if centres is p["means"] else centres, (camera.width, camera.height))
-        names = "means", "quats", "scales", "opacities", "sh0", "shN"
-        drawn = {name: getattr(splats, name) for name in names} | {"detail": p["detail"]}
-        return AutogradShot(shot.image, shot.means2d, shot.visible, p, slot, drawn if found == "by name" else None)
+        return replace(shot, slot=slot, drawn=drawn if found == "by name" else None)
 
     lr, hr = render(view.lr.camera), render(view.hr.camera, host.params.get("detail"))
     if found == "by name":
@@ -217,17 +240,8 @@ def test_what_reaches_the_colours_and_the_rasterizer_counts_once(found):
             joint_loss(conductor, host.params, lr, hr, view, 5)
         return
     joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
-    objective, leaves = conductor.objective, [*map(host.params.get, ("means", "opacities", "sh0")), network.weight]
-    (of_lr,) = objective.lr(lr.image.detach(), view.lr.image, None).cotangents
-    of_hr = objective.hr(hr.image.detach(), view.hr.image, None).cotangents
-    at_hr = of_hr[0] + objective.lambda_hf * of_hr[1]
-    expected = [
-        a + b
-        for a, b in zip(
-            torch.autograd.grad(lr.image, leaves, of_lr), torch.autograd.grad(hr.image, leaves, at_hr), strict=True
-        )
-    ]
-    for leaf, g in zip(leaves, expected, strict=True):
+    leaves = [*map(host.params.get, ("means", "opacities", "sh0")), network.weight]
+    for leaf, g in zip(leaves, gradients(conductor.objective, lr, hr, view, *leaves), strict=True):
         torch.testing.assert_close(leaf.grad, g, rtol=1e-4, atol=1e-4 * float(g.abs().max()))
 
 
@@ -241,19 +255,12 @@ def test_what_moves_the_means_also_learns_from_hr_where_a_rasterizer_takes_centr
     host.params["means"].requires_grad_(not frozen)
 
     def render(camera, detail=None):
-        p, means = host.params, host.params["means"] + torch.nn.functional.pad(shift, (0, 1))
-        splats = Splats(means, p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"], detail)
-        shot = autograd.draw(toy.RASTERIZER, splats, camera, means[:, :2] * 1)
-        return AutogradShot(shot.image, shot.means2d, shot.visible, p)
+        means = host.params["means"] + torch.nn.functional.pad(shift, (0, 1))
+        return host.draw(camera, detail, means[:, :2] * 1, means=means)
 
     lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
     joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
-    objective = conductor.objective
-    (of_lr,) = objective.lr(lr.image.detach(), view.lr.image, None).cotangents
-    base, hf = objective.hr(hr.image.detach(), view.hr.image, None).cotangents
-    (expected,) = torch.autograd.grad(lr.image, shift, of_lr)
-    (of_hr,) = torch.autograd.grad(hr.image, shift, base + objective.lambda_hf * hf)
-    torch.testing.assert_close(shift.grad, expected + objective.lambda_hr(5) * of_hr)
+    torch.testing.assert_close(shift.grad, *gradients(conductor.objective, lr, hr, view, shift))
 
 
 def test_a_tensor_that_reaches_the_rasterizer_and_its_image_learns_from_lr_alone_and_a_warning_tells(caplog):
@@ -261,19 +268,15 @@ def test_a_tensor_that_reaches_the_rasterizer_and_its_image_learns_from_lr_alone
     gain, network = torch.ones(1, requires_grad=True), torch.ones(3, requires_grad=True)
 
     def render(camera, detail=None):
-        p, colours = host.params, host.params["sh0"] * gain * network
-        splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), colours, p["shN"], detail)
-        shot = autograd.draw(toy.RASTERIZER, splats, camera)
-        return AutogradShot(shot.image * gain, shot.means2d, shot.visible, p)
+        shot = host.draw(camera, detail, sh0=host.params["sh0"] * gain * network)
+        return replace(shot, image=shot.image * gain)
 
     lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
     joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
-    (of_lr,) = conductor.objective.lr(lr.image.detach(), view.lr.image, None).cotangents
+    of_lr, *_ = cotangents(conductor.objective, lr, hr, view)
     torch.testing.assert_close(gain.grad, torch.autograd.grad(lr.image, gain, of_lr, retain_graph=True)[0])
-    base, hf = conductor.objective.hr(hr.image.detach(), view.hr.image, None).cotangents
-    (expected,) = torch.autograd.grad(lr.image, network, of_lr)
-    (of_hr,) = torch.autograd.grad(hr.image, network, base + conductor.objective.lambda_hf * hf)
-    torch.testing.assert_close(network.grad, expected + conductor.objective.lambda_hr(5) * of_hr)  # what is not shared
+    (of_both,) = gradients(conductor.objective, lr, hr, view, network)
+    torch.testing.assert_close(network.grad, of_both)  # what is not shared
     assert "learn from LR alone" in caplog.text
 
 
@@ -281,11 +284,11 @@ def test_what_a_host_copies_for_the_screen_gradient_is_told_without_a_wait_for_t
     host, conductor, view, *_ = drawn()
 
     def render(camera, detail=None):
-        p, centres = host.params, torch.zeros(20, 3, requires_grad=True) + 0
-        splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"], detail)
-        shot = autograd.draw(toy.RASTERIZER, splats, camera, centres[:, :2])
-        slot = ScreenGradientSlot(centres, (camera.width, camera.height))
-        return AutogradShot(shot.image, shot.means2d.detach(), shot.visible, p, slot)
+        centres = torch.zeros(20, 3, requires_grad=True) + 0
+        shot = host.draw(camera, detail, centres[:, :2])
+        return replace(
+            shot, means2d=shot.means2d.detach(), slot=ScreenGradientSlot(centres, (camera.width, camera.height))
+        )
 
     lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
     monkeypatch.setattr(torch, "equal", None)
@@ -301,18 +304,11 @@ def test_a_compiled_loop_calls_the_loss_outside_of_its_graph(recwarn):
 def test_f_det_may_be_named_beside_the_colours_that_are_computed_from_it():
     host, view = Host(scene := toy.scene(20)), scene.train[0]
     conductor = Conductor(objective=HR_FROM_START)
-    own = host.render(view.lr.camera, detail=False)
-
-    def render(p, sh0, **offset):
-        drawn = dict(p, scales=p["scales"].exp(), opacities=p["opacities"].sigmoid(), sh0=sh0, **offset)
-        names = "means", "quats", "scales", "opacities", "sh0", "shN"
-        shot = autograd.draw(toy.RASTERIZER, Splats(*(drawn[name] for name in names)), view.hr.camera)
-        return AutogradShot(shot.image, shot.means2d, shot.visible, host.params, drawn=drawn)
-
-    detail = host.params["detail"]
-    hr = render(host.params, host.params["sh0"] + detail[:, None])
-    joint_loss(conductor, host.params, own, hr, view, 5)[0].backward()
-    hf = conductor.objective.hr(hr.image.detach(), view.hr.image, None).cotangents[1]
+    lr, detail = host.render(view.lr.camera, detail=False), host.params["detail"]
+    drawn = host.activated(sh0=host.params["sh0"] + detail[:, None])
+    hr = replace(host.draw(view.hr.camera, **drawn), drawn=drawn)
+    joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
+    *_, hf = cotangents(conductor.objective, lr, hr, view)
     (expected,) = torch.autograd.grad(hr.image, detail, conductor.objective.lambda_hf * hf)
     torch.testing.assert_close(detail.grad, expected * conductor.objective.lambda_hr(5))
 
@@ -340,10 +336,9 @@ def test_what_is_drawn_may_have_other_rows_than_the_parameters(rows, made, known
     exposure = torch.eye(3).requires_grad_()
 
     def render(camera, detail):
-        p = host.params
-        each = (p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"], 0.5 * detail)
+        each = host.activated()
         with autograd.collected_drawings() as drawings:
-            shot = autograd.draw(toy.RASTERIZER, Splats(*map(rows, each)), camera)
+            shot = host.draw(camera, rows(0.5 * detail), **{name: rows(x) for name, x in each.items()})
         drawn = rows(torch.arange(20.0)).long()[:20]
         slot = ScreenGradientSlot(shot.means2d[: len(drawn)], (camera.width, camera.height), rows=drawn)
         visible = torch.zeros(20, dtype=torch.bool).index_copy_(0, drawn, shot.visible[: len(drawn)])
@@ -351,9 +346,9 @@ def test_what_is_drawn_may_have_other_rows_than_the_parameters(rows, made, known
         images = {
             "drawn": shot.image,
             "exposed": shot.image @ exposure,
-            "brightened": shot.image + 0.1 * each[3].mean(),
+            "brightened": shot.image + 0.1 * each["opacities"].mean(),
         }
-        return AutogradShot(images[made], means2d, visible, p, slot, drawings=drawings if known else ())
+        return AutogradShot(images[made], means2d, visible, host.params, slot, drawings=drawings if known else ())
 
     lr, hr = render(view.lr.camera, torch.zeros(20, 3)), render(view.hr.camera, host.params["detail"])
     if known and made == "exposed" and rows is not ROWS["as they are"]:
@@ -442,20 +437,10 @@ def test_f_det_at_lr_or_not_at_hr_and_a_strategy_that_has_not_started_are_refuse
 def test_a_parameter_of_another_name_is_summed():
     scene = toy.scene(20)
     host, view, conductor = Host(scene), scene.train[0], Conductor(GCO(), objective=HR_FROM_START)
-    host.params["tint"] = torch.zeros(20, 3, requires_grad=True)
-
-    def render(camera, detail=0):
-        p = host.params
-        offset = p["tint"] + detail
-        splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"], offset)
-        shot = autograd.draw(toy.RASTERIZER, splats, camera)
-        return AutogradShot(shot.image, shot.means2d, shot.visible, p)
-
-    lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
+    tint = host.params["tint"] = torch.zeros(20, 3, requires_grad=True)
+    lr, hr = host.draw(view.lr.camera, tint + 0), host.draw(view.hr.camera, tint + host.params["detail"])
     joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
-    (g_lr,) = lr.vjp(conductor.objective.lr(lr.image.detach(), view.lr.image, None).cotangents)
-    base, hf = hr.vjp(conductor.objective.hr(hr.image.detach(), view.hr.image, None).cotangents)
-    torch.testing.assert_close(host.params["tint"].grad, g_lr["tint"] + base["tint"] + 0.2 * hf["tint"])
+    torch.testing.assert_close(tint.grad, *gradients(conductor.objective, lr, hr, view, tint))
 
 
 def test_a_rendering_of_another_size_is_refused():
