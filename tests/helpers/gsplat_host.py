@@ -99,11 +99,11 @@ def trained(host: Host, scene, conductor: Conductor, names, /, **settings) -> At
     return clear
 
 
-def started(*strategies, host=None, scene=None, **settings):
-    """A host on the toy scene, CLEAR in its loop, and a function that renders its photo i."""
+def started(*strategies, conductor=None, host=None, scene=None, **settings):
+    """A host on the toy scene, CLEAR in its loop, by default with HR from the start, and a function that renders its photo i."""
     scene = scene or toy.scene(20)
     host = host or Host(scene)
-    clear = attached(host, scene, Conductor(*strategies, objective=HR_FROM_START), **settings)
+    clear = attached(host, scene, conductor or Conductor(*strategies, objective=HR_FROM_START), **settings)
 
     def render(i=0, **call):
         return drawn(host.rasterization, host.splats, scene.train[i].lr.camera, **call)[0]

@@ -102,9 +102,7 @@ def test_renderings_of_no_photo_train_nothing_and_look_the_same_once_the_detail_
 
 @pytest.mark.parametrize(("iterations", "share"), [(300, 0.2), (30_000, 1)])
 def test_f_det_learns_at_a_lower_rate_in_a_short_run(iterations, share):
-    scene = toy.scene(20)
-    host = Host(scene)
-    attached(host, scene, composed_conductor("baseline", iterations=iterations))
+    host, *_ = started(conductor=composed_conductor("baseline", iterations=iterations))
     assert host.optimizers["detail"].param_groups[0]["lr"] == pytest.approx(LearningRates().detail * share)
 
 

@@ -270,10 +270,9 @@ def test_the_gated_opacities_of_a_step_are_not_kept_with_their_graph():
 
 
 def test_the_detail_feature_has_the_type_of_what_is_drawn():
-    scene = toy.scene(20)
-    host = Host(scene)
+    host = Host(toy.scene(20))
     host.splats["means"] = torch.nn.Parameter(host.splats["means"].detach().double())
-    clear = gsplat_host.attached(host, scene, Conductor(objective=HR_FROM_START))
+    _, clear, _ = started(host=host)
     drawn = {**host.splats, "means": host.splats["means"].float()}
     gsplat_host.drawn(host.rasterization, drawn, host.photos["view0"].camera)[0].mean().backward()
     assert clear.attachment.counts["merges"] == 1
@@ -369,12 +368,10 @@ def test_a_host_that_draws_twice_for_one_rendering_has_the_same_gradients_and_is
 def test_a_detail_feature_whose_ten_gradients_no_optimizer_steps_on_gives_a_warning(
     stepped, accumulation, objective, warnings, caplog
 ):
-    scene = toy.scene(20)
-    host = Host(scene)
     conductor = Conductor(P2G(patch=4), objective=objective, statistics_from=0)  # HR is drawn without λ_HR, too
-    clear = gsplat_host.attached(host, scene, conductor, accumulation=accumulation)
+    host, clear, render = started(conductor=conductor, accumulation=accumulation)
     for i in range(12):
-        host.render(scene.train[i % 3].lr.camera)[0].mean().backward()
+        render(i % 3).mean().backward()
         if (i + 1) % accumulation == 0:
             host.optimizers["detail" if stepped else "means"].step()
     assert clear.attachment.counts["HR renders"] == 12

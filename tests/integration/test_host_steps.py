@@ -21,7 +21,7 @@ from integration.detail import DETAIL_EPS
 from integration.gsplat import attach
 from rasterizers import autograd
 from tests.helpers import gsplat_host, toy
-from tests.helpers.gsplat_host import Host, attached, started
+from tests.helpers.gsplat_host import Host, started
 from tests.helpers.host_parts import HR_FROM_START, photometric
 
 ADAM = {"lr": 1e-3, "eps": 1e-15}
@@ -33,13 +33,13 @@ def separate(splats):
 
 @pytest.mark.parametrize("clips", [False, True])
 def test_an_overflow_is_a_step_that_the_scaler_skips_for_f_det_too(clips, caplog):
-    scene, scaler = toy.scene(20), torch.amp.GradScaler("cpu", init_scale=2.0**14)
-    host = Host(scene, rasterization=functools.partial(autograd.rasterization, backend="torch"))
+    scaler = torch.amp.GradScaler("cpu", init_scale=2.0**14)
     conductor = Conductor(GCO(), objective=HR_FROM_START, detail=DetailRates(decay=0))
-    attached(host, scene, conductor, loss_scale=scaler.get_scale)
+    host, _, render = started(conductor=conductor, loss_scale=scaler.get_scale)
+    targets = [photo.image for photo in host.photos.values()]
     for i in range(4):
-        view, before = scene.train[i % 3], host.splats["detail"].detach().clone()
-        loss = photometric(host.render(view.lr.camera, 3)[0][0], view.lr.image) * (float("inf") if i == 2 else 1.0)
+        before = host.splats["detail"].detach().clone()
+        loss = photometric(render(i % 3)[0], targets[i % 3]) * (float("inf") if i == 2 else 1.0)
         for o in host.optimizers.values():
             o.zero_grad()
         scaler.scale(loss).backward()
@@ -188,10 +188,9 @@ def test_a_step_without_a_strategy_is_refused_at_first_and_told_later_with_its_c
 @pytest.mark.parametrize(("backwards", "accumulation", "told"), [(2, 1, 1), (1, 1, 0), (2, 2, 0), (3, 2, 1)])
 def test_more_backward_passes_than_accumulation_names_are_told_once(backwards, accumulation, told, caplog):
     """Each would bring the whole HR gradient."""
-    scene = toy.scene(20)
-    host = Host(scene, accumulation=backwards)
-    attached(host, scene, Conductor(), accumulation=accumulation)
-    host.train([scene.train[0].name] * 3 * backwards)
+    host = Host(toy.scene(20), accumulation=backwards)
+    started(host=host, conductor=Conductor(), accumulation=accumulation)
+    host.train(["view0"] * 3 * backwards)
     assert caplog.text.count(f"but accumulation={accumulation}. If the loop divides each loss") == told
 
 
@@ -435,17 +434,15 @@ def test_a_loop_resumes_between_the_passes_of_a_step_with_the_same_bits():
 @pytest.mark.parametrize("passes", [1, 2])
 @pytest.mark.parametrize("decay", [0.0, 0.5])
 def test_f_det_fades_with_a_step_and_not_with_passes_that_the_loop_drops(decay, passes):
-    scene = toy.scene(20)
-    host = Host(scene)
     conductor = Conductor(objective=HR_FROM_START, detail=DetailRates(decay=decay))
-    attached(host, scene, conductor, accumulation=passes)
+    host, _, render = started(conductor=conductor, accumulation=passes)
     host.splats["detail"].data += 1.0
     host.optimizers["detail"].param_groups[0]["lr"] = 0.0
 
     def share_after(n, *, steps):
         before = float(host.splats["detail"].mean())
         for i in range(n):
-            host.render(scene.train[i].lr.camera)[0].mean().backward()
+            render(i).mean().backward()
         for optimizer in host.optimizers.values():
             if steps:
                 optimizer.step()
@@ -464,19 +461,19 @@ def test_f_det_fades_with_a_step_and_not_with_passes_that_the_loop_drops(decay, 
 )
 def test_hr_is_left_out_of_every_second_step_but_where_a_densifier_reads_its_score(threshold, anchor_start, with_hr):
     """It has half its size then."""
-    scene, widths, logs = toy.scene(20), set(), []
+    widths, logs = set(), []
 
     @functools.wraps(autograd.rasterization)
     def recorded(**call):
         widths.add(call["width"])
         return gsplat_host.rasterization(**call)
 
-    host = Host(scene, rasterization=recorded)
+    host = Host(toy.scene(20), rasterization=recorded)
     strategies = P2G(patch=4), SVS(anchor_start=anchor_start)
     conductor = Conductor(*strategies, objective=HR_FROM_START, skips=Skips(coarse_until=100, hr_every=2))
     strategy = SimpleNamespace(refine_stop_iter=0, grow_grad2d=threshold)
-    clear = attached(host, scene, conductor, strategy=strategy)
-    host.train([scene.train[i % 3].name for i in range(6)], between=lambda: logs.append(clear.attachment.log))
+    _, clear, _ = started(host=host, conductor=conductor, strategy=strategy)
+    host.train([*host.photos] * 2, between=lambda: logs.append(clear.attachment.log))
     assert [int(log["t"]) for log in logs if "mean_q" in log] == with_hr
     assert clear.attachment.counts["HR renders"] == len(with_hr)
     assert clear.attachment.counts["merges"] == 6
@@ -487,9 +484,7 @@ def test_hr_is_left_out_of_every_second_step_but_where_a_densifier_reads_its_sco
 def test_a_loop_that_an_error_ends_is_not_told_of_its_length(fails, caplog, monkeypatch):
     gc.collect()  # of earlier tests, whose attachments tell it when they are freed
     caplog.clear()
-    scene = toy.scene(20)
-    host = Host(scene)
-    clear = attached(host, scene, composed_conductor("gco"))
+    host, clear, _ = started(conductor=composed_conductor("gco"))
 
     def end():
         try:
@@ -499,7 +494,7 @@ def test_a_loop_that_an_error_ends_is_not_told_of_its_length(fails, caplog, monk
                 clear.remove()
 
     with pytest.raises(ValueError, match="of the loop"):
-        host.train([scene.train[0].name], between=end)
+        host.train(["view0"], between=end)
     monkeypatch.setattr(sys, "last_value", ValueError(), raising=False)  # as Python does at the end of a program
     clear.remove()
     assert clear.attachment.counts["merges"] == 1
@@ -512,12 +507,11 @@ def test_what_an_earlier_error_holds_is_freed():
     class Failed(Exception):
         pass
 
-    scene = toy.scene(20)
     try:
         raise Failed
     except Failed as error:
         held = weakref.ref(error)
-        clear = attached(Host(scene), scene, composed_conductor("gco"))
+        _, clear, _ = started(conductor=composed_conductor("gco"))
     gc.collect()
     assert held() is None
     clear.remove()
@@ -525,16 +519,14 @@ def test_what_an_earlier_error_holds_is_freed():
 
 def test_a_loop_that_ends_before_hr_takes_part_is_told(caplog):
     caplog.set_level("INFO")
-    scene = toy.scene(20)
-    host = Host(scene)
-    clear = attached(host, scene, composed_conductor("gco"), iterations=120)
+    host, clear, _ = started(conductor=composed_conductor("gco"), iterations=120)
     assert "HR takes part from step 501 on" in caplog.text
     assert "501 on, but the loop has 120 steps. Make the conductor for the length of the loop" in caplog.text
-    host.train([view.name for view in scene.train])
+    host.train(host.photos)
     clear.remove()
     assert "HR took no part in the 3 steps of this loop: it would from step 501 on" in caplog.text
     caplog.clear()
-    attached(Host(scene), scene, composed_conductor("gco", iterations=120), iterations=120)
+    started(conductor=composed_conductor("gco", iterations=120), iterations=120)
     assert "HR takes part from step 7 on" in caplog.text
     assert "the loop has" not in caplog.text
 

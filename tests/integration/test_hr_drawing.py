@@ -21,7 +21,7 @@ from rasterizers import replayed_drawing
 from rasterizers.recording import running
 from tests.helpers import toy
 from tests.helpers.backends import needs
-from tests.helpers.gsplat_host import Host, attached, drawn
+from tests.helpers.gsplat_host import Host, attached, started
 from tests.helpers.host_parts import HR_FROM_START
 
 SCENE = toy.scene(20)
@@ -168,15 +168,13 @@ def test_an_offset_of_the_colours_gets_what_it_gets_of_the_hosts_function():
     """The colours are then no tensor of sh0 and shN side by side."""
 
     def gradients(hr_by):
-        host = Host(SCENE)
-        clear = attached(host, SCENE, Conductor(cs.GCO(), objective=HR_FROM_START), hr_by=hr_by)
+        host, clear, render = started(cs.GCO(), scene=SCENE, hr_by=hr_by)
         offset = torch.zeros(1, 1, 3, requires_grad=True)
         function = host.rasterization
         host.rasterization = lambda m, q, s, o, colors, *more, **call: function(
             m, q, s, o, colors + offset, *more, **call
         )
-        image = drawn(host.rasterization, host.splats, SCENE.train[0].lr.camera)[0][0]
-        (image - SCENE.train[0].lr.image).abs().mean().backward()
+        (render()[0] - SCENE.train[0].lr.image).abs().mean().backward()
         clear.remove()
         return {name: p.grad for name, p in host.splats.items()} | {"offset": offset.grad}
 
@@ -186,16 +184,15 @@ def test_an_offset_of_the_colours_gets_what_it_gets_of_the_hosts_function():
 @pytest.mark.parametrize("frozen", [False, True], ids=["apart", "alone"])
 def test_an_offset_of_the_colours_learns_the_same_in_a_pass_of_its_own(frozen):
     def gradient(*passes):
-        host, offset = Host(SCENE), torch.nn.Parameter(torch.full((1, 1, 3), 0.1))
-        attached(host, SCENE, Conductor(cs.GCO(), objective=HR_FROM_START))
+        host, _, render = started(cs.GCO(), scene=SCENE)
+        offset = torch.nn.Parameter(torch.full((1, 1, 3), 0.1))
         function, gaussians = host.rasterization, list(host.splats.values())
         host.rasterization = lambda m, q, s, o, colors, *more, **call: function(
             m, q, s, o, colors + offset, *more, **call
         )
         for p in gaussians:
             p.requires_grad_(not frozen)
-        image = drawn(host.rasterization, host.splats, SCENE.train[0].lr.camera)[0][0]
-        loss = (image - SCENE.train[0].lr.image).abs().mean()
+        loss = (render()[0] - SCENE.train[0].lr.image).abs().mean()
         for one in passes:
             one(loss, gaussians, offset)
         return offset.grad
@@ -227,13 +224,12 @@ def test_small_gradients_pass_through_half_precision_by_the_scale_of_the_loss():
     ],
 )
 def test_what_this_package_does_not_draw_is_refused_where_it_was_asked_to(call, reason):
-    host = Host(SCENE)
-    clear = attached(host, SCENE, Conductor(objective=HR_FROM_START), hr_by="torch")
+    host, clear, render = started(scene=SCENE, hr_by="torch")
     function = host.rasterization
     if call.get("sh_degree", 3) is None:
         host.rasterization = lambda m, q, s, o, colors, *more, **call: function(m, q, s, o, colors[:, 0], *more, **call)
     with pytest.raises(ValueError, match=reason):
-        drawn(host.rasterization, host.splats, SCENE.train[0].lr.camera, **call)
+        render(**call)
     clear.remove()
 
 
@@ -339,8 +335,8 @@ def test_a_mask_that_the_host_changes_or_adds_hides_from_then_on(monkeypatch):
         hr_drawing, "enlarged_mask", lambda mask, factor: shown.append(bool(mask.any())) or enlarged(mask, factor)
     )
     first, second = (view for view in SCENE.train[:2])
-    host, masks = Host(SCENE), {first.name: torch.ones(16, 24, dtype=torch.bool)}
-    attached(host, SCENE, Conductor(objective=HR_FROM_START), masks=masks)
+    masks = {first.name: torch.ones(16, 24, dtype=torch.bool)}
+    host, *_ = started(scene=SCENE, masks=masks)
     host.train([first.name])
     masks[first.name].zero_()
     host.train([first.name])

@@ -182,6 +182,6 @@ def test_photos_are_written_with_their_masks_which_hide_at_both_scales(dataset, 
 def hr_gradient(views, mask):
     """Σ |∂(L_base + L_HF) / ∂ means| of the first view."""
     scene = replace(toy.scene(24), train=views)
-    host, _, render = gsplat_host.started(host=gsplat_host.Host(scene), scene=scene, masks={NAMES[0]: mask})
+    host, _, render = gsplat_host.started(scene=scene, masks={NAMES[0]: mask})
     (render() * 0).sum().backward()  # nothing of the photo
     return float(host.splats["means"].grad.abs().sum())
