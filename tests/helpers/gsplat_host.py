@@ -61,6 +61,11 @@ class Host:
             optimizer.step()
             optimizer.zero_grad()
 
+    def prune(self, n):
+        """Replace the parameters, as a densifier does, by those without the first n Gaussians."""
+        for name, p in self.splats.items():
+            self.splats[name] = torch.nn.Parameter(p.detach()[n:], requires_grad=p.requires_grad)
+
     def gradients(self):
         return {name: p.grad for name, p in self.splats.items() if p.grad is not None}
 

@@ -89,8 +89,7 @@ def test_the_state_of_gsplat_1_4_carries_the_rows_and_must_know_their_origin():
     state, recorder = {}, toy.Recorder()
     host, _, render = gsplat_host.started(recorder, SplatSuRe(), state=state)
     assert ROWS not in host.splats
-    for name, p in host.splats.items():
-        host.splats[name] = torch.nn.Parameter(p.detach()[1:])
+    host.prune(1)
     state[ROWS] = state[ROWS][1:]
     render()
     assert torch.equal(recorder.changes[0], torch.arange(1, 20))
@@ -229,8 +228,7 @@ def test_a_loop_goes_back_to_a_checkpoint_with_another_number_of_gaussians():
         render(i).mean().backward()
     state = copy.deepcopy(clear.attachment.state_dict())
     stored = {name: p.detach().clone() for name, p in host.splats.items() if name != ROWS}
-    for name, p in host.splats.items():
-        host.splats[name] = torch.nn.Parameter(p.detach()[5:], requires_grad=p.requires_grad)
+    host.prune(5)
     render(0).mean().backward()
     host.splats.update({name: torch.nn.Parameter(p) for name, p in stored.items()})
     clear.attachment.load_state_dict(state)
@@ -259,8 +257,7 @@ def test_a_strategy_sees_the_raw_parameters_until_the_structure_changes_and_whic
     host.splats["means"].data[5] += 1_000
     before = {name: p.detach().clone() for name, p in clear.params().items()}
     render(0).mean().backward()
-    for name, p in host.splats.items():
-        host.splats[name] = torch.nn.Parameter(p.detach()[1:], requires_grad=p.requires_grad)
+    host.prune(1)
     render(1)
     (merging, visible), (stepped, still_visible) = reads.seen
     assert merging.keys() == before.keys()
@@ -278,8 +275,7 @@ def test_gaussians_that_a_host_adds_in_the_step_of_the_anchor_are_there_before_i
         render(t % 3).mean().backward()
         host.step()
         if t == last:
-            for name, p in host.splats.items():
-                host.splats[name] = torch.nn.Parameter(p.detach()[1:], requires_grad=p.requires_grad)
+            host.prune(1)
     assert clear.attachment.conductor.state_dict()["SVS.means"].shape == (19, 3)
 
 
@@ -292,8 +288,7 @@ def test_a_loop_that_converts_all_its_parameters_keeps_the_rows_or_is_refused():
             p.data = p.data.half() if p is host.splats[ROWS] else p.data
         if halved_after_a_render:
             render()
-        for name, p in host.splats.items():
-            host.splats[name] = torch.nn.Parameter(p.detach()[1:], requires_grad=p.requires_grad)
+        host.prune(1)
         with (
             nullcontext()
             if halved_after_a_render
