@@ -1,11 +1,12 @@
 """A trainer like those in gsplat's documentation, on a CPU, with our rasterizer: `Host` contains nothing of CLEAR."""
 
 import functools
+from dataclasses import replace
 
 import torch
 
 import rasterizers
-from clear_strategies import Conductor
+from clear_strategies import Conductor, Photo, View
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.geometry.projection import intrinsics
@@ -139,6 +140,15 @@ def densified(
 
 
 RASTERIZER = rasterizers.load("torch", near=0.01, kernel=0.3, antialiased=False)
+
+
+def doubled(view: View) -> View:
+    """The view with its images and poses in float64."""
+
+    def photo(p: Photo) -> Photo:
+        return Photo(replace(p.camera, world_to_camera=p.camera.world_to_camera.double()), p.image.double())
+
+    return View(view.name, photo(view.lr), photo(view.hr))
 
 
 def in_double(scene: Scene, conductor: Conductor, steps: int, eps: float = 1e-15) -> TrainState:

@@ -223,6 +223,11 @@ def scene():
     return replace(made, train=tuple(replace(v, hr=v.hr.reduced(2)) for v in made.train))
 
 
+def separate(splats):
+    """An Adam for each parameter."""
+    return {name: torch.optim.Adam([p], **ADAM) for name, p in splats.items() if p.is_floating_point()}
+
+
 class Running:
     """A loop with CLEAR in it."""
 
@@ -237,7 +242,9 @@ class Running:
                        "shift": Parameter(torch.full((1, 3), 0.01)),
                        "bands": Parameter(0.3 * torch.rand(20, 16, 3, generator=chance))}  # fmt: skip
         one = torch.optim.Adam(self.splats.values(), **ADAM)
-        self.optimizers = {"joined": one, "joined in a dictionary": {"all": one}}.get(loop.optimizers, self.separate())
+        self.optimizers = {"joined": one, "joined in a dictionary": {"all": one}}.get(
+            loop.optimizers, separate(self.splats)
+        )
         self.conductor = Conductor(*[GCO()] * loop.corrects, objective=HR_FROM_START)
         self.clear = attach(
             self.splats, self.optimizers, scene().train, self.conductor, accumulation=loop.accumulation,
@@ -245,9 +252,6 @@ class Running:
         )  # fmt: skip
         self.splats["detail"].data += 0.2 * torch.randn(20, 3, generator=chance)
         self.function = self.clear.wrap(FUNCTIONS[loop.function])
-
-    def separate(self):
-        return {name: torch.optim.Adam([p], **ADAM) for name, p in self.splats.items() if p.is_floating_point()}
 
     def tensors(self):
         return {**{k: p for k, p in self.splats.items() if k != ROWS}, **self.beside}
@@ -294,7 +298,7 @@ class Running:
         for p in self.tensors().values():
             p.grad = p.grad if loop.zeros or p.grad is None else None
         if loop.optimizers == "made anew" and number == 0:
-            self.optimizers.update(self.separate())
+            self.optimizers.update(separate(self.splats))
         return brought
 
     def prune(self):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clear_strategies import GCO, P2G, SVS, Conductor, Objective, Photo, StrategyConflict, View
+from clear_strategies import GCO, P2G, SVS, Conductor, Objective, StrategyConflict
 from clear_strategies.compose import conductor as composed_conductor
 from clear_strategies.data.priors.interface import Bicubic
 from clear_strategies.geometry.projection import intrinsics
@@ -20,8 +20,8 @@ from integration.gsplat import attach
 from integration.pending import BackwardPass
 from integration.views import view
 from rasterizers import autograd
-from tests.helpers import toy
-from tests.helpers.gsplat_host import RASTERIZER, Host, attached, drawn, in_double, rasterization, started, trained
+from tests.helpers import gsplat_host, toy
+from tests.helpers.gsplat_host import RASTERIZER, Host, attached, drawn, rasterization, started, trained
 from tests.helpers.host_parts import HR_FROM_START
 
 STEPS = 50
@@ -40,20 +40,13 @@ def conductor(name):
     return Conductor(*subset(name), objective=stretched, statistics_from=round(500 * STEPS / 10_000))
 
 
-def double(view):
-    def photo(p):
-        return Photo(replace(p.camera, world_to_camera=p.camera.world_to_camera.double()), p.image.double())
-
-    return View(view.name, photo(view.lr), photo(view.hr))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["baseline", "clear"])
 def test_fifty_steps_equal_those_of_our_own_trainer(name):
     """With a larger ε than that of training, also because of rounding errors. What fails with one strategy fails with all."""
     scene = toy.scene(40)
-    scene = replace(scene, train=tuple(map(double, scene.train)))
-    own = in_double(scene, conductor(name), STEPS, EPS)
+    scene = replace(scene, train=tuple(map(gsplat_host.doubled, scene.train)))
+    own = gsplat_host.in_double(scene, conductor(name), STEPS, EPS)
     host = Host(scene, extent=own.optimizer.extent, eps=EPS)
     for p in host.splats.values():
         p.data = p.data.double()

@@ -23,12 +23,7 @@ from rasterizers import autograd
 from tests.helpers import gsplat_host, toy
 from tests.helpers.gsplat_host import Host, started
 from tests.helpers.host_parts import HR_FROM_START, photometric
-
-ADAM = {"lr": 1e-3, "eps": 1e-15}
-
-
-def separate(splats):
-    return {name: torch.optim.Adam([p], **ADAM) for name, p in splats.items() if p.is_floating_point()}
+from tests.helpers.loops import ADAM, separate
 
 
 @pytest.mark.parametrize("clips", [False, True])

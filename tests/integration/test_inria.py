@@ -14,18 +14,7 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
-from clear_strategies import (
-    GCO,
-    P2G,
-    SVS,
-    Conductor,
-    DataError,
-    Objective,
-    Photo,
-    RandomBackground,
-    SplatSuRe,
-    View,
-)
+from clear_strategies import GCO, P2G, SVS, Conductor, DataError, Objective, RandomBackground, SplatSuRe
 from clear_strategies.data.priors import Images
 from clear_strategies.errors import SettingError
 from clear_strategies.geometry import projection
@@ -40,7 +29,7 @@ from integration.inria.from_options import install
 from rasterizers import Splats, autograd
 from rasterizers.differentiable import outer
 from tests.helpers import toy
-from tests.helpers.gsplat_host import RASTERIZER, in_double
+from tests.helpers.gsplat_host import RASTERIZER, doubled, in_double
 from tests.helpers.host_parts import FOLDER, FROM_START, HR_FROM_START, WITHOUT_HR, N, loop, options
 
 STEPS = 25
@@ -74,23 +63,17 @@ def trained(host, folder, strategies, objective=HR_FROM_START, also=lambda gauss
     return gaussians, clear, grads
 
 
-def double(view, camera):
-    """The view without the rounding errors of the host's float32 projection, which 25 steps would amplify."""
-
-    def photo(p):
-        w, h = p.camera.width, p.camera.height
-        fx, fy = w / 2 / math.tan(camera.FoVx / 2), h / 2 / math.tan(camera.FoVy / 2)
-        pose = p.camera.world_to_camera.double()
-        return Photo(replace(p.camera, world_to_camera=pose, fx=fx, fy=fy, cx=w / 2, cy=h / 2), p.image.double())
-
-    return View(view.name, photo(view.lr), photo(view.hr))
-
-
 class InDouble(HostViews):
-    """The views in double precision."""
+    """The views without the rounding errors of the host's float32 projection, which 25 steps would amplify."""
 
     def find(self, camera):
-        return double(super().find(camera), camera)
+        def photo(p):
+            w, h = p.camera.width, p.camera.height
+            fx, fy = w / 2 / math.tan(camera.FoVx / 2), h / 2 / math.tan(camera.FoVy / 2)
+            return replace(p, camera=replace(p.camera, fx=fx, fy=fy, cx=w / 2, cy=h / 2))
+
+        view = doubled(super().find(camera))
+        return replace(view, lr=photo(view.lr), hr=photo(view.hr))
 
 
 def test_its_steps_equal_those_of_our_own_trainer(inria_host, inria_capture, monkeypatch):
