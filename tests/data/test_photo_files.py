@@ -14,6 +14,7 @@ from PIL import Image, ImageOps
 from clear_strategies.data import photo_files, photo_folders
 from clear_strategies.data.photo_folders import FRAMES, HDR
 from clear_strategies.errors import DataError
+from tests.helpers.image_files import exif_orientation, png, png_chunk
 
 ENDINGS = (".png", ".jpg", ".webp", ".tiff")
 
@@ -83,13 +84,8 @@ def test_a_png_file_that_lacks_its_palette_is_refused(tmp_path: Path) -> None:
 
 
 def test_sixteen_bit_grey_with_alpha_is_composited(tmp_path: Path) -> None:
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 16, 4, 0, 0, 0))  # 16 bits, grey with alpha
-    pixels = chunk(b"IDAT", zlib.compress(b"\0" + struct.pack(">HH", 65535, 13107)))  # white, alpha 0.2
     path = tmp_path / "a.png"
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + header + pixels + chunk(b"IEND", b""))
+    path.write_bytes(png(1, 1, 16, 4, b"\0" + struct.pack(">HH", 65535, 13107)))  # grey with alpha: white, alpha 0.2
     torch.testing.assert_close(photo_files.read_image(path), torch.full((1, 1, 3), 0.2))
 
 
@@ -121,8 +117,7 @@ def test_a_photo_of_too_many_pixels_is_read_as_their_means_and_its_size_is_that(
 def test_a_turned_photo_is_read_as_it_is_stored_or_upright(ending: str, orientation: int, tmp_path: Path) -> None:
     left_above = np.zeros((12, 16, 3), np.uint8)
     left_above[:6, :4] = 255
-    exif = Image.Exif()
-    exif[0x0112] = orientation
+    exif = exif_orientation(orientation)
     path = save(tmp_path / f"a{ending}", left_above, exif=exif)
     upright = ImageOps.exif_transpose(Image.open(save(tmp_path / "turned.png", left_above, exif=exif)))
     for turn, expected in ((False, left_above), (True, np.asarray(upright))):
@@ -136,9 +131,7 @@ def test_a_turned_photo_is_read_as_it_is_stored_or_upright(ending: str, orientat
 
 
 def test_a_rotation_that_a_png_file_has_behind_its_pixels_is_known_before_they_are_decoded(tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    path = save(tmp_path / "a.png", np.zeros((12, 16, 3), np.uint8), exif=exif)
+    path = save(tmp_path / "a.png", np.zeros((12, 16, 3), np.uint8), exif=exif_orientation(6))
     data = path.read_bytes()
     first, last = data.index(b"eXIf") - 4, data.index(b"IDAT") - 4
     path.write_bytes(data[:first] + data[last:-12] + data[first:last] + data[-12:])  # IEND has 12 bytes
@@ -256,11 +249,8 @@ def test_alpha_and_16_bits_keep_their_photos_colours(tmp_path: Path) -> None:
     assert torch.allclose(read, in_srgb(LEVELS) * 128 / 255 + 127 / 255, atol=1.5 / 255)
     file = tmp_path / "b.png"
     assert cv2.imwrite(str(file), LEVELS[..., ::-1].astype(np.uint16) * 257)
-    chunk = b"iCCP" + b"P3\0\0" + zlib.compress(P3)
     data = file.read_bytes()  # the header's chunk ends at byte 33
-    file.write_bytes(
-        data[:33] + struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:]
-    )
+    file.write_bytes(data[:33] + png_chunk(b"iCCP", b"P3\0\0" + zlib.compress(P3)) + data[33:])
     assert torch.allclose(photo_files.read_image(file), in_srgb(LEVELS), atol=1.5 / 255)
 
 

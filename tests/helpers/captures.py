@@ -23,6 +23,7 @@ from clear_strategies.data.readers import colmap, demo
 from clear_strategies.data.readers import nerfstudio as read_nerfstudio
 from clear_strategies.data.view_settings import ViewSettings
 from rasterizers import Camera
+from tests.helpers.image_files import exif_orientation
 
 WIDTH, HEIGHT = 16, 12
 FOCAL = 20.0
@@ -100,10 +101,8 @@ def turn(path: Path, orientation: int, *, rotate: bool = True) -> np.ndarray:
     """Store a photo turned, as its EXIF block then says; its upright pixels. Without `rotate` the block alone changes."""
     with Image.open(path) as image:
         upright = image.convert("RGB")
-    exif = Image.Exif()
-    exif[0x0112] = orientation
     stored = {3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}[orientation]
-    (upright.transpose(stored) if rotate else upright).save(path, exif=exif)
+    (upright.transpose(stored) if rotate else upright).save(path, exif=exif_orientation(orientation))
     return np.array(upright)
 
 

@@ -1,5 +1,7 @@
-"""Random images that a PNG holds exactly, and finding one inside a larger image."""
+"""Random images that a PNG holds exactly, finding one inside a larger image, PNG files of given bytes, and EXIF blocks."""
 
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,23 @@ def array(seed: int, height: int = 40, width: int = 60) -> np.ndarray:
 
 def read(path: Path) -> np.ndarray:
     return np.asarray(Image.open(path).convert("RGB"))
+
+
+def png_chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def png(width: int, height: int, bits: int, colors: int, pixels: bytes) -> bytes:
+    """A PNG file; `colors` is its colour type, and `pixels` may be fewer than its header promises."""
+    header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, colors, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + png_chunk(b"IDAT", zlib.compress(pixels)) + png_chunk(b"IEND", b"")
+
+
+def exif_orientation(orientation: int) -> Image.Exif:
+    """The EXIF block of a photo that is stored turned."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    return exif
 
 
 def holds(page: np.ndarray, image: np.ndarray, times: int = 1) -> bool:

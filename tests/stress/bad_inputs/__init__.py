@@ -5,8 +5,6 @@
 
 import os
 import re
-import struct
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import Any
 
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.jobs import exit_codes
+from tests.helpers.image_files import png
 from tests.stress.rows import Row, failures
 
 
@@ -39,12 +38,7 @@ class BadInput:
 
 def bomb(width: int, height: int) -> bytes:
     """A PNG of a few bytes whose header promises width x height pixels."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(b"\0")) + chunk(b"IEND", b"")
+    return png(width, height, 8, 2, b"\0")
 
 
 class Canary:

@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from clear_strategies.data.photo_files import read_header, read_image
+from tests.helpers.image_files import exif_orientation
 from tests.stress.bad_inputs import BadInput, a_device, at, bomb
 
 
@@ -19,12 +20,6 @@ def _encoded(form: str, mode: str = "RGB", size: tuple[int, int] = (40, 30), **o
     stream = io.BytesIO()
     Image.fromarray(noise).convert(mode).save(stream, form, **options)
     return stream.getvalue()
-
-
-def _turned(form: str, orientation: int) -> bytes:
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    return _encoded(form, exif=exif)
 
 
 def _pages(form: str) -> bytes:
@@ -72,8 +67,11 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "TIFF of floats": (_read(_encoded("TIFF", "F")), "a.png: colour mode: is F"),
     "TIFF of 32-bit numbers": (_read(_encoded("TIFF", "I")), "a.png: colour mode: is I"),
     "LAB TIFF": (_read(_encoded("TIFF", "LAB")), "a.png: colour mode: is LAB"),
-    **{f"JPEG turned by EXIF {i}": (_read(_turned("JPEG", i)), f"EXIF orientation: is {i}") for i in range(2, 9)},
-    "PNG turned by EXIF": (_read(_turned("PNG", 6)), "EXIF orientation: is 6"),
+    **{
+        f"JPEG turned by EXIF {i}": (_read(_encoded("JPEG", exif=exif_orientation(i))), f"EXIF orientation: is {i}")
+        for i in range(2, 9)
+    },
+    "PNG turned by EXIF": (_read(_encoded("PNG", exif=exif_orientation(6))), "EXIF orientation: is 6"),
     "another size": (_read(_PNG, expect=(30, 40)), "a.png: size: is 40x30 where 30x40 is expected"),
     "larger than allowed": (_read(bomb(30_000, 20_000)), "a.png: size: 30000x20000 is more than 500,000,000 pixels"),
     "header of 3.6 gigapixels": (_read(bomb(60_000, 60_000)), "a.png: (size|file)"),

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from tests.helpers import captures as tiny
+from tests.helpers.image_files import exif_orientation
 from tests.stress.bad_inputs import BadInput
 
 Spoil = Callable[[Path], object]
@@ -97,9 +98,8 @@ def link_in_circle(name: str) -> Spoil:
 
 
 def turned(root: Path) -> None:
-    exif = Image.Exif()
-    exif[0x0112] = 3
-    Image.new("RGB", (tiny.WIDTH, tiny.HEIGHT)).save(root / "images/b.png", format="JPEG", exif=exif)
+    photo = Image.new("RGB", (tiny.WIDTH, tiny.HEIGHT))
+    photo.save(root / "images/b.png", format="JPEG", exif=exif_orientation(3))
 
 
 def two_images_of_one_name(root: Path) -> None:
