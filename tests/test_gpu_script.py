@@ -3,12 +3,12 @@
 import os
 import re
 import subprocess
-from pathlib import Path
 
 from clear_strategies.bench.__main__ import parser
 from tests.helpers.configs import composed
+from tests.helpers.paths import ROOT
 
-SCRIPT = Path(__file__).resolve().parents[1] / ".ci" / "gpu"
+SCRIPT = ROOT / ".ci" / "gpu"
 
 
 def test_every_command_is_understood_and_a_step_that_fails_or_is_cut_off_stops_no_other(tmp_path):
@@ -46,4 +46,4 @@ def test_every_command_is_understood_and_a_step_that_fails_or_is_cut_off_stops_n
         elif module == "clear_strategies.run":
             assert composed(*(word for word in arguments if not word.startswith("hydra."))).fit.device == "cuda"
         else:
-            assert all(Path(word).exists() for word in arguments if word.startswith("tests/"))
+            assert all((ROOT / word).exists() for word in arguments if word.startswith("tests/"))

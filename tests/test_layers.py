@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-
+from tests.helpers.paths import ROOT
 
 PAGE = (ROOT / "docs" / "explanation" / "architecture.md").read_text()
 

@@ -21,8 +21,7 @@ from clear_strategies.compose import conductor
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.options import OPTIONS
 from tests.helpers.command_line import TINY, started
-
-ROOT = Path(__file__).resolve().parents[1]
+from tests.helpers.paths import ROOT
 
 
 def test_the_names_are_the_same_in_all_three_places_and_another_is_an_attribute_error():

@@ -14,7 +14,7 @@ from clear_strategies import hydra_app, run
 from clear_strategies.commands import doctor
 from clear_strategies.errors import SettingError
 from tests.helpers import command_line
-from tests.helpers.forked import ROOT
+from tests.helpers.paths import ROOT
 
 SLOW = ("hydra", "numpy", "omegaconf", "torch")
 

@@ -176,22 +176,12 @@ def nerfstudio(root: Path, listed: Callable[[str], str] = str) -> Path:
     return root
 
 
-def demo_on_disk(
-    root: Path,
-    scale: float = 1.0,
-    views: int = 4,
-    size: tuple[int, int] = (64, 48),
-    pose: Callable[[int], int] = lambda i: i,
-) -> Path:
-    """Views of the demo's room as a nerfstudio capture, in other units: `scale` units to one of the room's.
-
-    Args:
-        pose: the view whose pose a photo's frame has.
-    """
+def demo_on_disk(root: Path, scale: float = 1.0, views: int = 4, size: tuple[int, int] = (64, 48)) -> Path:
+    """Views of the demo's room as a nerfstudio capture, in other units: `scale` units to one of the room's."""
     frames = []
     for i, frame in enumerate(views_of := demo.read(width=size[0], height=size[1], views=views, train=2).frames):
         write_png(root / f"images/{i}.png", frame.load().image)
-        matrix = np.linalg.inv(views_of[pose(i)].camera.world_to_camera.double().numpy()) @ np.diag([1.0, -1, -1, 1])
+        matrix = np.linalg.inv(frame.camera.world_to_camera.double().numpy()) @ np.diag([1.0, -1, -1, 1])
         matrix[:3, 3] *= scale
         frames.append({"file_path": f"images/{i}.png", "transform_matrix": matrix.tolist()})
     camera = views_of[0].camera

@@ -76,8 +76,8 @@ def stopped_by(*signals: int, after: int) -> str:
     )
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 120, what: str = "it") -> None:
-    deadline = time.monotonic() + seconds
+def wait_for(condition: Callable[[], bool], what: str = "it") -> None:
+    deadline = time.monotonic() + 120
     while not condition():
-        assert time.monotonic() < deadline, f"waited {seconds:g} s for {what}"
+        assert time.monotonic() < deadline, f"waited 120 s for {what}"
         time.sleep(0.05)

@@ -23,7 +23,8 @@ from typing import IO, Any
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.helpers.paths import ROOT
+
 # What a run imports. None of them starts a thread or asks for a GPU, which no fork would have.
 _IMPORTED = (
     "clear_strategies.hydra_app", "clear_strategies.jobs.job", "clear_strategies.report", "cv2", "filelock", "imageio_ffmpeg",

@@ -118,7 +118,7 @@ def started(*strategies, conductor=None, host=None, scene=None, **settings):
 
 
 def densified(
-    conductor: Conductor, strategy=None, steps: int = 30, *, colors_stay: bool = False, packed: bool = False
+    conductor: Conductor, strategy=None, *, colors_stay: bool = False, packed: bool = False
 ) -> tuple[Host, Attached]:
     """A host on the toy scene of 40 Gaussians, trained with CLEAR while gsplat's default strategy, or another, densifies.
 
@@ -135,7 +135,7 @@ def densified(
     host = Host(scene, extent=4.0, strategy=strategy, packed=packed)
     if colors_stay:
         host.optimizers["sh0"].param_groups[0]["lr"] = 0.0
-    names = [scene.train[i % 3].name for i in range(steps)]
+    names = [view.name for view in scene.train] * 10
     return host, trained(host, scene, conductor, names, strategy=strategy)
 
 

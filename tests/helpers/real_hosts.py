@@ -16,8 +16,8 @@ from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import write_points
 from tests.helpers import toy
 from tests.helpers.host_parts import FROM_START
+from tests.helpers.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 HOSTS = ROOT / "tests" / "hosts"
 
 

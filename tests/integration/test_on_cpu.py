@@ -4,7 +4,6 @@ import importlib
 import math
 import re
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -19,8 +18,8 @@ from integration.on_cpu.fused_ssim import fused_ssim
 from integration.on_cpu.simple_knn import distances_and_indices
 from tests.helpers import command_line
 from tests.helpers.host_parts import FOLDER, FROM_START
+from tests.helpers.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 WIDTH, HEIGHT, FOCAL = 48, 36, 50.0
 FORKS = {
     "3dgs": {"antialiasing": False},

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 
-_ROOT = Path(__file__).resolve().parents[2]
+from tests.helpers.paths import ROOT
+
 _KERNELS = "clear_strategies/kernels/src"
-_INCLUDES = [f"-I{_ROOT / folder}" for folder in ("rasterizers/native/src", "rasterizers/cpp/src", _KERNELS)]
+_INCLUDES = [f"-I{ROOT / folder}" for folder in ("rasterizers/native/src", "rasterizers/cpp/src", _KERNELS)]
 _CHECKS = "tests/rasterizers/native_checks.cpp"
 _RESULTS = ("tests/kernels/native_results.cpp", f"{_KERNELS}/step.cpp", f"{_KERNELS}/reconcile.cpp")
 _TYPES = next(Path("/usr").glob("include/**/bits/types.h"), None)  # glibc's; none on macOS
@@ -32,7 +33,7 @@ def test_it_compiles_with_clang_where_int64_is_long_long(source, tmp_path):
         types = re.sub(r"\blong int (__u?int64_t;)", r"long long int \1", _TYPES.read_text())
         (tmp_path / "bits" / "types.h").write_text(types)
     includes = [f"-I{tmp_path}", *_INCLUDES]
-    command = [str(_CLANG), "-x", "c++", "-std=c++20", "-fsyntax-only", *includes, str(_ROOT / source)]
+    command = [str(_CLANG), "-x", "c++", "-std=c++20", "-fsyntax-only", *includes, str(ROOT / source)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
@@ -40,7 +41,7 @@ def test_it_compiles_with_clang_where_int64_is_long_long(source, tmp_path):
 def built(compiler, program, *arguments):
     """The path of a program of these sources, which needs nothing beside it."""
     subprocess.run(
-        [compiler, "-static", "-std=c++20", *_FLAGS, *_INCLUDES, *arguments, "-o", program], check=True, cwd=_ROOT
+        [compiler, "-static", "-std=c++20", *_FLAGS, *_INCLUDES, *arguments, "-o", program], check=True, cwd=ROOT
     )
     return str(program)
 

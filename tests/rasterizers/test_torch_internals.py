@@ -9,8 +9,8 @@ import torch
 from torch.nn import Parameter
 
 from rasterizers import torch_internals as of_torch
+from tests.helpers.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 HIDDEN = {  # attributes of torch's objects
     "_version", "_backward_hooks", "_post_accumulate_grad_hooks", "_schema", "_input_metadata",
 }  # fmt: skip
