@@ -197,8 +197,8 @@ def sum_of_blobs(p, colours, camera):
 
 def test_the_graph_of_a_rasterizer_that_loops_in_torch_is_not_walked_at_each_of_its_nodes(monkeypatch, caplog):
     """A network before it learns from LR alone. A walk at each node would take longer than the step."""
-    host, view, seen = Host(scene := toy.scene(20)), scene.train[0], []
-    conductor, offset, leaf_of = Conductor(objective=HR_FROM_START), torch.zeros(3, requires_grad=True), graph.leaf_of
+    host, conductor, view, *_ = drawn()
+    offset, leaf_of, seen = torch.zeros(3, requires_grad=True), graph.leaf_of, []
     monkeypatch.setattr(graph, "leaf_of", lambda node: (seen.append(node), leaf_of(node))[1])
     del host.params["detail"], host.params["shN"]
 
@@ -229,10 +229,10 @@ def test_what_reaches_the_colours_and_the_rasterizer_counts_once(found):
         if found == "in torch":
             image, centres = sum_of_blobs(p, sh0, camera)
             return AutogradShot(image, centres, torch.ones(20, dtype=torch.bool), p)
-        drawn = host.activated(means=centres, sh0=sh0)
-        shot = host.draw(camera, detail, **drawn)
+        named = host.activated(means=centres, sh0=sh0)
+        shot = host.draw(camera, detail, **named)
         slot = ScreenGradientSlot(shot.means2d if centres is p["means"] else centres, (camera.width, camera.height))
-        return replace(shot, slot=slot, drawn=drawn if found == "by name" else None)
+        return replace(shot, slot=slot, drawn=named if found == "by name" else None)
 
     lr, hr = render(view.lr.camera), render(view.hr.camera, host.params.get("detail"))
     if found == "by name":
@@ -302,11 +302,10 @@ def test_a_compiled_loop_calls_the_loss_outside_of_its_graph(recwarn):
 
 
 def test_f_det_may_be_named_beside_the_colours_that_are_computed_from_it():
-    host, view = Host(scene := toy.scene(20)), scene.train[0]
-    conductor = Conductor(objective=HR_FROM_START)
-    lr, detail = host.render(view.lr.camera, detail=False), host.params["detail"]
-    drawn = host.activated(sh0=host.params["sh0"] + detail[:, None])
-    hr = replace(host.draw(view.hr.camera, **drawn), drawn=drawn)
+    host, conductor, view, lr, _ = drawn()
+    detail = host.params["detail"]
+    named = host.activated(sh0=host.params["sh0"] + detail[:, None])
+    hr = replace(host.draw(view.hr.camera, **named), drawn=named)
     joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
     *_, hf = cotangents(conductor.objective, lr, hr, view)
     (expected,) = torch.autograd.grad(hr.image, detail, conductor.objective.lambda_hf * hf)
@@ -435,8 +434,7 @@ def test_f_det_at_lr_or_not_at_hr_and_a_strategy_that_has_not_started_are_refuse
 
 
 def test_a_parameter_of_another_name_is_summed():
-    scene = toy.scene(20)
-    host, view, conductor = Host(scene), scene.train[0], Conductor(GCO(), objective=HR_FROM_START)
+    host, conductor, view, *_ = drawn(GCO())
     tint = host.params["tint"] = torch.zeros(20, 3, requires_grad=True)
     lr, hr = host.draw(view.lr.camera, tint + 0), host.draw(view.hr.camera, tint + host.params["detail"])
     joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
