@@ -89,8 +89,8 @@ class Console(logging.StreamHandler[Any]):
         return self._tag + _PREFIXES.get(record.levelno, "") + super().format(record)
 
     def emit(self, record: logging.LogRecord) -> None:
-        bars = sys.modules.get("tqdm")  # not imported: there is no bar
-        with contextlib.nullcontext() if bars is None else bars.tqdm.external_write_mode(file=self.stream):
+        bars = getattr(sys.modules.get("tqdm"), "tqdm", None)  # not imported: there is no bar
+        with contextlib.nullcontext() if bars is None else bars.external_write_mode(file=self.stream):
             super().emit(record)
 
 
@@ -103,7 +103,7 @@ def show(*, verbose: bool = False) -> None:
 
 def show_in_host() -> None:
     """In another trainer, print our messages as "[clear] …" to stderr, above its bar, unless it handles logging itself."""
-    if logging.getLogger().handlers:
+    if logging.getLogger().handlers or sys.stderr is None:
         return
     handler = Console(sys.stderr, tag="[clear] ")
     for logger in map(logging.getLogger, _OURS):

@@ -38,6 +38,7 @@ from clear_strategies.jobs import exit_codes, sweep
 from clear_strategies.options import CONF
 
 _log = logging.getLogger(__name__)
+_begun: Final = list[str]()  # the folders of this program's sweeps
 
 FAILED: Final = "failed.txt"
 """In the folder of a sweep's job: why it failed; beside the folder, behind its name, where that holds a finished run."""
@@ -69,6 +70,7 @@ def main(overrides: Sequence[str] | None = None) -> None:
         setattr(options, name, folder and files.expanded(folder))
     exit_codes.require("train")
     version.setbase("1.3")
+    _begun.clear()
     try:
         _run_hydra(options, parser, job, str(CONF), "config")
     except (HydraException, OmegaConfBaseException) as error:
@@ -76,6 +78,10 @@ def main(overrides: Sequence[str] | None = None) -> None:
         raise not_composed(error, overrides, "config") from error
     except BrokenProcessPool as error:
         raise sweep.worker_ended(error) from error
+    except KeyboardInterrupt:  # between two jobs
+        for folder in _begun:
+            _tell_how_to_go_on(folder)
+        raise
 
 
 def readable(word: str) -> str:
@@ -156,7 +162,8 @@ def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resum
 
         finished = resume.begun(folder) == "results"  # its folder stays as it is
         note = folder.with_name(f"{folder.name}_{FAILED}") if finished else folder / FAILED
-        files.write_text(note, f"job {HydraConfig.get().job.num}: {message}\n")
+        text = f"job {HydraConfig.get().job.num}: {message}\n"
+        files.write_text(note, text.encode(errors="backslashreplace").decode())  # a file's name may not be Unicode
         return
     if (signum := code - exit_codes.SIGNALS) > 0:
         if signum not in signals.STOPS:
@@ -187,6 +194,7 @@ class SweepCallback(Callback):
         for note in Path(config.hydra.sweep.dir).rglob(f"*{FAILED}"):  # of an earlier sweep
             note.unlink()
         sweep.name_by_all_that_is_swept(config)
+        _begun.append(config.hydra.sweep.dir)
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         if signals.told:

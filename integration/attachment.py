@@ -218,9 +218,10 @@ class Attachment:
         later step without a strategy.
         """
         if has_merged:
-            if self._host.loss_scale is None and (scaler := stepping_scaler()) and (scale := scaler.get_scale()) != 1:
+            adds = self._host.loss_scale is None and (self.conductor.uses_hr or self.conductor.regularizers)
+            if adds and (scaler := stepping_scaler()) and (scale := scaler.get_scale()) != 1:
                 raise HostError(
-                    f"the loop steps by a gradient scaler, which multiplies its loss by {scale:g}, but not that of HR. Pass "
+                    f"the loop steps by a gradient scaler, which multiplies its loss by {scale:g}, but not what is added. Pass "
                     "loss_scale=scaler.get_scale; train a 3DGS-style loop without it."
                 )
             self._merging.fading.before_step(max(self.passes, self._host.accumulation))

@@ -80,10 +80,21 @@ def leave_out_what_methods_set_aside(config: DictConfig) -> None:
     strategy, method = words.get("strategy"), words.get("method")
     if strategy is None or method is None or [*words].index("method") < [*words].index("strategy"):
         return
-    chosen = method.value()
-    if strategy.is_sweep_override() and all(chosen.list if isinstance(chosen, ChoiceSweep) else [chosen]):
+    chosen, baseline = method.value(), f"{strategy.get_key_element()}=baseline"
+    if not (strategy.is_sweep_override() and all(chosen.list if isinstance(chosen, ChoiceSweep) else [chosen])):
+        return
+    jobs = dict[str, list[str]]()  # one of each method, with a strategy other than the baseline
+    for job in _overrides_of_jobs(config):
+        if baseline not in job:
+            jobs[next(word for word in job if word.startswith(f"{method.get_key_element()}="))] = job
+    of_strategy = f"{strategy.get_key_element()}="
+    alone = [[baseline if word.startswith(of_strategy) else word for word in job] for job in jobs.values()]
+    if all(
+        _strategies_of(config, job) == _strategies_of(config, its)
+        for job, its in zip(jobs.values(), alone, strict=True)
+    ):
         with read_write(config.hydra):  # of one key the last counts
-            config.hydra.overrides.task.append(f"{strategy.get_key_element()}=baseline")
+            config.hydra.overrides.task.append(baseline)
 
 
 def name_by_all_that_is_swept(config: DictConfig) -> None:
@@ -118,6 +129,12 @@ def _overrides_of_jobs(config: DictConfig) -> list[list[str]]:
         return []
     (jobs,) = BasicSweeper.split_arguments(_words(config), None)
     return jobs
+
+
+def _strategies_of(config: DictConfig, overrides: list[str]) -> Any:
+    """The strategies and what wraps them, by these overrides."""
+    job = GlobalHydra.instance().config_loader().load_sweep_config(config, overrides)
+    return job.get("strategies"), job.get("decorators")
 
 
 def _jobs(config: DictConfig) -> Iterator[DictConfig]:

@@ -225,15 +225,22 @@ def _differences(single: pd.DataFrame, key: str, means: pd.Series[float], agains
 
 def _references(single: pd.DataFrame, key: str, against: str | None) -> dict[str, str]:
     """The key of the reference of each method: the one called `against`, else the baseline, else the first; of several that
-    differ in their settings, the one that has the settings of the method.
+    differ in their settings, the one that has the most of the method's, and no others.
     """
     rows = zip(single[key], single["method"], (run.name for run in single["run"]), strict=True)
     first, label, name = max(rows, key=lambda row: (row[1] == against, row[2] == against, row[2] == _BASELINE))
-    settings = {method: "".join(method.partition("\n")[1:]) for method in single[key]}
+    settings = {method: {word.lstrip("+") for word in method.split("\n")[1:]} for method in single[key]}
     if label == against != name:
         return dict.fromkeys(settings, first)
-    compared = {its for method, its in settings.items() if method != name + its}
-    return {m: name + its if its in compared and name + its in settings else first for m, its in settings.items()}
+    references = [method for method in settings if method.partition("\n")[0] == name]
+
+    def nearest(method: str) -> str:
+        possible = [its for its in references if settings[its] <= settings[method]]
+        best: str = max(possible, key=lambda its: len(settings[its]), default=first)
+        return best
+
+    chosen = {method: nearest(method) for method in settings if method not in references}
+    return {method: chosen.get(method, method if method in chosen.values() else first) for method in settings}
 
 
 def _in_all(lists: Sequence[Sequence[str]]) -> list[str]:

@@ -53,7 +53,7 @@ class Attached:
         sr: the folder of the SR images, or a function that makes them (`clear_strategies.data.priors` has some). None:
             there are none, for strategies and objectives that do not use HR. suffix: what the SR tool appended to the names.
         factor: HR pixels per LR pixel.
-        threshold: opt.densify_grad_threshold (by default 3DGS's own), which scales P2G's score; None: the loop does not densify.
+        threshold: opt.densify_grad_threshold (by default 3DGS's own), which scales P2G's score; None: it reads no score.
         densify_until: opt.densify_until_iter; refused where an anchor would be taken before.
         detail: train the detail feature f_det beside the host's parameters.
         own_background: the host chooses the colour behind its renderings (`--random_background`); else the strategies may choose

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from functools import partial
 from importlib import metadata
 
@@ -13,6 +14,7 @@ import rasterizers
 from clear_strategies import hydra_app, run
 from clear_strategies.commands import doctor
 from clear_strategies.errors import SettingError
+from rasterizers import gsplat_backend
 from tests.helpers import command_line
 from tests.helpers.paths import ROOT
 
@@ -116,10 +118,10 @@ def test_doctor_names_versions_memory_backends_and_missing_extras(capsys, monkey
 
 
 def test_gsplat_which_has_cut_offs_of_its_own_alone_is_tested_by_them(capsys, monkeypatch):
-    load = rasterizers.load
-    here = {"device": "cpu", "rasterization": partial(rasterizers.rasterization, backend="torch")}
+    ours, on_cpu = partial(rasterizers.rasterization, backend="torch"), frozenset({"cpu"})
+    monkeypatch.setattr(gsplat_backend, "_gsplat_rasterization", lambda: ours)
+    monkeypatch.setattr(gsplat_backend, "_TRAITS", replace(gsplat_backend._TRAITS, devices=on_cpu))
     monkeypatch.setattr(rasterizers, "names", lambda: ["gsplat"])
-    monkeypatch.setattr(rasterizers, "load", lambda name, **s: load(name, **s, **(here if name == "gsplat" else {})))
     doctor.main([])
     assert f"{'gsplat':32}works: differs from the reference by" in capsys.readouterr().out
 

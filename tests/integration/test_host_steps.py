@@ -11,11 +11,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from clear_strategies import GCO, P2G, SVS, Conductor, FadingOpacity
+from clear_strategies import GCO, P2G, SVS, Conductor, FadingOpacity, Objective
 from clear_strategies.compose import conductor as composed_conductor
 from clear_strategies.errors import SettingError
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.skips import Skips
+from clear_strategies.schedules import WarmupDecay
 from integration import HostError
 from integration.detail import DETAIL_EPS
 from integration.gsplat import attach
@@ -52,15 +53,21 @@ def test_an_overflow_is_a_step_that_the_scaler_skips_for_f_det_too(clips, caplog
 
 @pytest.mark.parametrize("fused", [False, True])
 def test_a_scaler_whose_scale_is_not_told_is_refused_before_the_first_step(fused):
-    host, _, render = started(GCO())
-    before = host.splats["means"].detach().clone()
-    for enabled, scale in ((False, 1024.0), (True, 1.0), (True, 1024.0)):
+    alone = started(conductor=Conductor(objective=Objective(lambda_hr=WarmupDecay(peak=0, final=0))))
+    adds = started(GCO())
+    for (host, _, render), enabled, scale in (
+        (alone, True, 1024.0),
+        (adds, False, 1024.0),
+        (adds, True, 1.0),
+        (adds, True, 1024.0),
+    ):
+        before = host.splats["means"].detach().clone()
         scaler = torch.amp.GradScaler("cpu", init_scale=scale, enabled=enabled)
-        optimizer = torch.optim.Adam([p for p in host.splats.values() if p.requires_grad], lr=0, fused=fused)
+        optimizer = torch.optim.Adam([p for p in host.splats.values() if p.requires_grad], lr=1e-2, fused=fused)
         host.optimizers.update(all=optimizer)
         scaler.scale(render().mean()).backward()
-        refused = pytest.raises(HostError, match=r"multiplies its loss by 1024, but not that of HR. Pass loss_scale=")
-        with refused if scaler.get_scale() > 1 else nullcontext():
+        message = r"multiplies its loss by 1024, but not what is added. Pass loss_scale="
+        with pytest.raises(HostError, match=message) if host is adds[0] and scaler.get_scale() > 1 else nullcontext():
             scaler.step(optimizer)
         optimizer.zero_grad()
     assert torch.equal(host.splats["means"], before)

@@ -15,7 +15,7 @@ import torch
 from hydra.types import RunMode
 from omegaconf import OmegaConf, open_dict
 
-from clear_strategies import signals
+from clear_strategies import hydra_app, signals
 from clear_strategies.files import LOCK, HeldError, hold
 from clear_strategies.hydra_app import FAILED, SweepCallback
 from clear_strategies.jobs import device, sweep
@@ -197,6 +197,28 @@ def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, monkeypatch):
     assert "left to the other process" in said
     assert (tmp_path / "all" / "0" / "metrics.json").exists()
     assert not (tmp_path / "all" / "1" / "metrics.json").exists()
+
+
+def test_strategies_stay_in_a_sweep_of_a_method_of_ones_own_that_keeps_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(sweep.GlobalHydra, "instance", lambda: SimpleNamespace(config_loader=loader))
+    (tmp_path / "method").mkdir()
+    (tmp_path / "method/mine.yaml").write_text("# @package _global_\nfit:\n  keep: 2\n")
+    words = [f"hydra.searchpath=[file://{tmp_path}]", "+strategy=baseline,gco,svs", "+method=mine"]
+    config = loader().load_configuration("config", words, run_mode=RunMode.MULTIRUN)
+    sweep.leave_out_what_methods_set_aside(config)
+    jobs = sweep._overrides_of_jobs(config)
+    assert [job[0] for job in jobs] == [f"+strategy={name}" for name in ("baseline", "gco", "svs")]
+
+
+def test_a_sweep_that_is_stopped_between_two_jobs_tells_how_to_go_on(monkeypatch, caplog):
+    def stopped(*_):
+        hydra_app._begun.append("all")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(hydra_app, "_run_hydra", stopped)
+    with caplog.at_level("INFO"), pytest.raises(KeyboardInterrupt):
+        hydra_app.main(["-m", "+strategy=gco,svs"])
+    assert caplog.messages[-1] == GO_ON
 
 
 def test_a_sweep_goes_on_after_a_job_with_a_bug_shows_its_traceback_and_reports_the_others(tmp_path):

@@ -277,6 +277,19 @@ def test_methods_of_two_settings_are_compared_with_the_baseline_of_their_own(tmp
     assert list(table["psnr_delta"]) == [-1.0, 0.0, -1.5, 0.5, 1.0]
 
 
+def test_a_setting_of_its_own_leaves_a_method_the_baseline_of_its_other_settings(tmp_path: Path) -> None:
+    for k, (words, psnr) in enumerate(
+        [
+            (("+strategy=baseline", "fit.z=1"), 30.0),
+            (("+strategy=baseline", "++fit.z=3"), 20.0),
+            (("+strategy=gco", "strategies.gco.tolerance=0.3", "fit.z=3"), 21.0),
+        ]
+    ):
+        make_run(tmp_path / str(k), *words, psnr=psnr)
+    (gain,) = (row["psnr_delta"] for name, row in rows_of(tmp_path).items() if name.startswith("gco"))
+    assert gain == 1.0
+
+
 def test_of_a_setting_that_is_given_twice_the_last_counts(tmp_path: Path) -> None:
     make_run(tmp_path / "0", "+strategy=gco", "fit.iterations=20")
     make_run(tmp_path / "1", "+strategy=gco", "fit.iterations=20", "fit.iterations=25")

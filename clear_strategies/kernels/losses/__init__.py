@@ -8,6 +8,8 @@ images. A chosen implementation raises `TypeError` or `ValueError` for images th
 
 from __future__ import annotations
 
+import logging
+from functools import cache
 from importlib import import_module
 from types import ModuleType
 from typing import Final, Literal, get_args
@@ -23,6 +25,8 @@ from clear_strategies.kernels.losses.reference import LossAndGradient
 from rasterizers.warp_runtime import require_warp
 
 __all__ = ["Choice", "LossAndGradient", "haar_l1", "photometric", "require", "ssim"]
+
+_log = logging.getLogger(__name__)
 
 Choice = Literal["auto", "torch", "cpp", "warp"]
 _CHOICES: Final = get_args(Choice)
@@ -89,6 +93,14 @@ def haar_l1(
 def _chosen(kernels: Choice, x: Tensor, y: Tensor) -> ModuleType:
     """The implementation, a module with the functions of `reference`."""
     if kernels == "auto":
-        return native.implementation(__name__, x, y) if supported(x, y) else reference
-    require(kernels, x.device.type)
-    return import_module(f"{__name__}.{'reference' if kernels == 'torch' else kernels}")
+        module = native.implementation(__name__, x, y) if supported(x, y) else reference
+    else:
+        require(kernels, x.device.type)
+        module = import_module(f"{__name__}.{'reference' if kernels == 'torch' else kernels}")
+    _log_once(module.__name__.rpartition(".")[2])
+    return module
+
+
+@cache
+def _log_once(which: str) -> None:
+    _log.debug("image losses: %s.", f"cpp, for {native.module().isa}" if which == "cpp" else which)
