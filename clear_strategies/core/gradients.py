@@ -143,7 +143,7 @@ class Shot(Protocol):
         """∇θ of Σ cotangent·image on the raw parameters, one per cotangent, each with `.screen`.
 
         Args:
-            weight: the last two are summed by it, see `summed`; None: nothing is.
+            weight: the last two are summed by it, see `summed`; None: nothing is. A shot of one's own may lack it.
         """
         ...
 

@@ -5,8 +5,10 @@ It is the same in every trainer. The order of an iteration is that of `Conductor
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any, TypeVar
 
 import torch
@@ -16,7 +18,7 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.core.conflicts import Weights
 from clear_strategies.core.finite import require_finite, require_finite_losses
-from clear_strategies.core.gradients import Grads, ScreenGradients, Shot, screen_norm, screen_of, to_ndc
+from clear_strategies.core.gradients import Grads, ScreenGradients, Shot, screen_norm, screen_of, summed, to_ndc
 from clear_strategies.core.step import Losses, Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.core.work_log import WorkLog
@@ -372,8 +374,18 @@ class Conductor(Hooks):
         return photo if is_final else photo.over(self.background(t), background)
 
 
-def _vjp(shot: Shot, *given: Tensor) -> Sequence[Grads]:
-    return shot.vjp(*given)
+def _vjp(
+    shot: Shot, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
+) -> Sequence[Grads]:
+    if weight is None:
+        return shot.vjp(cotangents)
+    return shot.vjp(cotangents, weight) if _sums(type(shot)) else summed(shot.vjp(cotangents), weight)
+
+
+@cache
+def _sums(kind: Any) -> bool:
+    """Whether `vjp` of this class of shots takes `weight`, which one's own may lack."""
+    return "weight" in inspect.signature(kind.vjp).parameters
 
 
 def _require_size(view: View, scale: Scale, render: Tensor) -> None:

@@ -67,6 +67,7 @@ def _require_same_sources(package: str, module: ModuleType) -> None:
         )
 
 
+@cache
 def load_kernels(package: str, isa: str | None = None) -> ModuleType:
     """One of `package`'s modules `_avx512`, `_avx2` and `_baseline`.
 
@@ -77,28 +78,18 @@ def load_kernels(package: str, isa: str | None = None) -> ModuleType:
         BackendUnavailable: none was compiled, or this processor cannot run the requested one.
         OutdatedKernels: they were compiled from other sources.
     """
-    found = _loaded(package, isa)
-    if isinstance(found, str):
-        raise BackendUnavailable(found)
-    return found
-
-
-@cache
-def _loaded(package: str, isa: str | None) -> ModuleType | str:
-    """The module, or why there is none: a failing import costs as much each time, and `empty_for` asks for every tensor."""
-    try:
-        baseline = importlib.import_module(f"{package}._baseline")
-    except ImportError as error:
-        return (
-            f"the compiled kernels of {package} are not installed ({error}). This is a pure-Python installation, about fifteen "
-            "times slower on a CPU: install a C++20 compiler (Debian: apt install g++; macOS: xcode-select --install) and "
-            "install clear-strategies again."
-        )
+    baseline = _baseline(package)
+    if isinstance(baseline, ImportError):
+        raise BackendUnavailable(
+            f"the compiled kernels of {package} are not installed ({baseline}). This is a pure-Python installation, about "
+            "fifteen times slower on a CPU: install a C++20 compiler (Debian: apt install g++; macOS: xcode-select --install) "
+            "and install clear-strategies again."
+        ) from baseline
     _require_same_sources(package, baseline)
     supported = [*baseline.instruction_sets(), "baseline"]
     requested, source = isa or os.environ.get(_VARIABLE), "isa" if isa else _VARIABLE
     if requested and requested not in supported:
-        return f"{source}={requested} cannot run here; this processor has {', '.join(supported)}."
+        raise BackendUnavailable(f"{source}={requested} cannot run here; this processor has {', '.join(supported)}.")
     for name in [requested] if requested else [name for name in _ISAS if name in supported]:
         try:
             module = importlib.import_module(f"{package}._{name}")
@@ -107,7 +98,18 @@ def _loaded(package: str, isa: str | None) -> ModuleType | str:
             continue
         _log.debug("%s: kernels for %s.", package, name)
         return module
-    return f"{package} was not compiled for {requested}; unset {source}."
+    raise BackendUnavailable(f"{package} was not compiled for {requested}; unset {source}.")
+
+
+@cache
+def _baseline(package: str) -> ModuleType | ImportError:
+    """The module that runs on each processor, or why there is none: a failing import costs as much each time, and `empty_for`
+    asks for every tensor.
+    """
+    try:
+        return importlib.import_module(f"{package}._baseline")
+    except ImportError as error:
+        return error.with_traceback(None)
 
 
 def empty(shape: Sequence[int], dtype: torch.dtype = torch.float32) -> Tensor:

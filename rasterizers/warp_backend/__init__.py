@@ -40,7 +40,7 @@ class WarpRasterizer(Backend):
 
     Raises:
         BackendUnavailable: Warp is not installed, or there is no CUDA device.
-        ValueError: a setting is out of range.
+        ValueError: a setting is out of range; or splats are not finite, when the image is first read.
     """
 
     memory: int = 4096

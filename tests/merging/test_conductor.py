@@ -572,6 +572,16 @@ def drawn():
     return field, view, *field.render_scales(toy.RASTERIZER, view)
 
 
+def test_a_shot_of_ones_own_need_not_sum(drawn):
+    field, view, lr, hr = drawn
+    mine = type("Mine", (SimpleNamespace,), {"vjp": lambda self, cotangents: hr.vjp(cotangents)})
+    shot = mine(image=hr.image, means2d=hr.means2d, visible=hr.visible)
+    found, expected = (updated((field, view, lr, x), P2G()).grads for x in (shot, hr))
+    assert found.keys() == expected.keys()
+    for name, g in expected.items():
+        torch.testing.assert_close(found[name], g, rtol=1e-4, atol=1e-8, msg=name)
+
+
 def updated(drawn, *strategies, **objective):
     field, view, lr, hr = drawn
     return Conductor(*strategies, objective=Objective(lambda_hr=ALWAYS, **objective)).update(

@@ -93,6 +93,11 @@ def test_without_compiled_kernels_the_error_says_what_to_install():
         native.load_kernels("rasterizers.reference")
 
 
+def look_anew():
+    native.load_kernels.cache_clear()
+    native._baseline.cache_clear()
+
+
 def test_compiled_kernels_that_are_missing_are_looked_for_once(monkeypatch):
     searched = []
 
@@ -100,14 +105,14 @@ def test_compiled_kernels_that_are_missing_are_looked_for_once(monkeypatch):
         searched.append(name)
         raise ImportError(name)
 
-    native._loaded.cache_clear()
+    look_anew()
     monkeypatch.setattr(native.importlib, "import_module", missing)
     try:
         for _ in range(2):
             assert native.empty_for(torch.zeros(2)).shape == (2,)
             assert not strategies_native.available()
     finally:
-        native._loaded.cache_clear()
+        look_anew()
     assert searched == ["rasterizers.cpp._baseline", "clear_strategies.kernels._baseline"]
 
 
@@ -120,12 +125,12 @@ def test_kernels_of_other_sources_are_refused_and_nothing_takes_their_place(stat
             monkeypatch.delattr(module, "sources")
         else:
             monkeypatch.setattr(module, "sources", stated)
-    native._loaded.cache_clear()
+    look_anew()
     for load in (cpp, strategies_native.available, rasterizers.fastest):
         with pytest.raises(OutdatedKernels, match=r"from other sources .* Install again: pip install") as refused:
             load()
         assert exit_codes.describe(refused.value) == (2, str(refused.value))
-    native._loaded.cache_clear()
+    look_anew()
 
 
 def test_an_instruction_set_that_the_processor_lacks_is_refused(monkeypatch):
@@ -136,7 +141,8 @@ def test_an_instruction_set_that_the_processor_lacks_is_refused(monkeypatch):
     with pytest.raises(BackendUnavailable, match="isa=z80 cannot run here"):
         native.load_kernels("rasterizers.cpp", "z80")
     monkeypatch.setenv("CLEAR_ISA", "z80")
-    native._loaded.cache_clear()
+    look_anew()
     with pytest.raises(BackendUnavailable, match="CLEAR_ISA=z80"):
         native.load_kernels("rasterizers.cpp")
-    native._loaded.cache_clear()
+    monkeypatch.delenv("CLEAR_ISA")
+    native.load_kernels("rasterizers.cpp")
