@@ -20,7 +20,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep, Override, OverrideType
+from hydra.core.override_parser.types import Override, OverrideType
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
@@ -76,25 +76,24 @@ def leave_out_what_methods_set_aside(config: DictConfig) -> None:
     """
     if config.hydra.runtime.choices["hydra/sweeper"] != "basic":  # others may have no `params`
         return
-    words = {word.key_or_group: word for word in _words(config)}  # Hydra composes them in this order
+    words = {word.key_or_group: word for word in _words(config)}
     strategy, method = words.get("strategy"), words.get("method")
-    if strategy is None or method is None or [*words].index("method") < [*words].index("strategy"):
+    if strategy is None or method is None or not strategy.is_sweep_override():
         return
-    chosen, baseline = method.value(), f"{strategy.get_key_element()}=baseline"
-    if not (strategy.is_sweep_override() and all(chosen.list if isinstance(chosen, ChoiceSweep) else [chosen])):
-        return
-    jobs = dict[str, list[str]]()  # one of each method, with a strategy other than the baseline
+    of_strategy, of_method = (f"{word.get_key_element()}=" for word in (strategy, method))
+    baseline, jobs = f"{of_strategy}baseline", dict[str, list[str]]()  # a job of each method, with another strategy
     for job in _overrides_of_jobs(config):
         if baseline not in job:
-            jobs[next(word for word in job if word.startswith(f"{method.get_key_element()}="))] = job
-    of_strategy = f"{strategy.get_key_element()}="
-    alone = [[baseline if word.startswith(of_strategy) else word for word in job] for job in jobs.values()]
-    if all(
-        _strategies_of(config, job) == _strategies_of(config, its)
-        for job, its in zip(jobs.values(), alone, strict=True)
-    ):
-        with read_write(config.hydra):  # of one key the last counts
-            config.hydra.overrides.task.append(baseline)
+            jobs[next(word for word in job if word.startswith(of_method))] = job
+
+    def is_set_aside(job: list[str]) -> bool:
+        alone = [baseline if word.startswith(of_strategy) else word for word in job]
+        return bool(_strategies_of(config, job) == _strategies_of(config, alone))
+
+    with suppress(HydraException, OmegaConfBaseException):  # Hydra, which composes all jobs next, raises the error
+        if all(map(is_set_aside, jobs.values())):
+            with read_write(config.hydra):  # of one key the last counts
+                config.hydra.overrides.task.append(baseline)
 
 
 def name_by_all_that_is_swept(config: DictConfig) -> None:
