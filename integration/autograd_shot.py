@@ -148,9 +148,7 @@ class AutogradShot:
             results.append(Grads(every_number(raw, self.params), screen=g.screen))
         return results if weight is None else summed(results, weight)
 
-    def gradients(
-        self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
-    ) -> list[Grads]:  # fmt: skip
+    def gradients(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None) -> list[Grads]:
         """The first part of `vjp`, by the names of `drawn`; for this package's rasterizers the colours' gradient is factors."""
         if self.drawing is not None:
             drawn = gradients_of(summed_vjp(self.drawing.rendering, self._at_drawing(cotangents), weight))

@@ -145,9 +145,7 @@ class Conductor(Hooks):
             return False
         return self.wants_lr
 
-    def update(
-        self, params: Mapping[str, Tensor], lr: Shot | None, hr: Shot | None, view: View, t: int
-    ) -> Update:  # fmt: skip
+    def update(self, params: Mapping[str, Tensor], lr: Shot | None, hr: Shot | None, view: View, t: int) -> Update:
         """The merged gradient of one view, in place of `backward()`.
 
         Args:

@@ -209,9 +209,7 @@ class FieldShot:
         self.activation = activation
         self._detail = detail
 
-    def gradients(
-        self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
-    ) -> list[Grads]:  # fmt: skip
+    def gradients(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None) -> list[Grads]:
         """As `vjp`, of the rendered splats: before the chain rule of `activation`, with the colours' gradient as factors."""
         return gradients_of(summed_vjp(self._rendering, cotangents, weight))
 

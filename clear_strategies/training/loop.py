@@ -79,13 +79,13 @@ def learn(s: TrainState, rasterizer: Rasterizer, inputs: ViewInputs) -> tuple[St
         lr, hr = θ.render_scales(  # Î_LR, Î_HR     Eq. 2, 3
             over(rasterizer, inputs.background), view, gate=inputs.gate, **inputs.scales
         )
-    params, step, scored = θ.raw(), s.compiled_step, s.density.collects(t)
+    params, compiled, scored = θ.raw(), s.compiled_step, s.density.collects(t)
     *_, finest = (shot for shot in (lr, hr) if shot is not None)
     g_lr, from_hr, u = conductor.gradients(
-        params, lr, hr, view, t, None if step is None else FieldShot.gradients, scored=scored,
-        weights=None if step is None else step.weights(t), looked_up=inputs.looked_up,
+        params, lr, hr, view, t, None if compiled is None else FieldShot.gradients, scored=scored,
+        weights=None if compiled is None else compiled.weights(t), looked_up=inputs.looked_up,
     )  # fmt: skip
-    if step is None:
+    if compiled is None:
         with stage("strategies"):
             g_hr = Grads() if from_hr is None else from_hr.routed
             grads, conflict, _ = conductor.merge(params, g_lr, g_hr, u.step, t, finite=True)
@@ -94,7 +94,7 @@ def learn(s: TrainState, rasterizer: Rasterizer, inputs: ViewInputs) -> tuple[St
             θ.constrain()
     else:
         with stage("per-Gaussian pass"):  # the same in one
-            conflict = step.step(params, finest, g_lr, from_hr, t)
+            conflict = compiled.step(params, finest, g_lr, from_hr, t)
     if scored:
         s.density.accumulate(u, finest, t)  # S^dens         Eq. 14
     low = images.area_mean(finest.image, view.factor) if lr is None else lr.image
