@@ -90,6 +90,11 @@ class WarmupDecay:
             if self.decay == "exponential" and getattr(self, name) == 0:
                 refuse(name, "must be above 0 for an exponential decay", 0, "decay=linear ends at 0")
 
+    @property
+    def zero_until(self) -> int | None:
+        """The iteration after which λ is above 0 for the first time; None: it is 0 throughout."""
+        return next((t for t in (self.start, self.decay_from) if self(t + 1) > 0), None)
+
     def __call__(self, t: int) -> float:
         if t <= self.start:
             return 0.0

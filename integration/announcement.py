@@ -35,10 +35,10 @@ class Once:
 def announce(conductor: Conductor, views: Sequence[View], host: Host) -> None:
     """After `on_fit_start`, log what each strategy will do, and which have no effect."""
     iterations = host.iterations
-    if (first := _first_hr(conductor)) is not None:
-        _log.info("HR takes part from step %d on (objective.lambda_hr.start).", first)
-        if iterations is not None and first > iterations:
-            _log.warning("HR takes part from step %d on, but the loop has %d steps. %s", first, iterations, _STRETCH)
+    if (start := conductor.objective.lambda_hr.zero_until) is not None:
+        _log.info("HR takes part after step %d (objective.lambda_hr).", start)
+        if iterations is not None and start >= iterations:
+            _log.warning("HR takes part after step %d, but the loop has %d steps. %s", start, iterations, _STRETCH)
     for s in conductor.strategies:
         if (prepared := s.summary()) is not None:
             _log.info("%s: %s.", type(s).__name__, prepared)
@@ -47,7 +47,8 @@ def announce(conductor: Conductor, views: Sequence[View], host: Host) -> None:
             "%s has no effect: the views were made without it. Make them with sr=conductor.prior(sr).",
             ", ".join(getattr(getattr(d, "func", d), "__name__", str(d)) for d in conductor.decorators),
         )
-    for phrase in conductor.skips.descriptions(views, hr_from=conductor.hr_from, in_host=True):
+    hr_from = conductor.hr_from(scored=host.threshold is not None)
+    for phrase in conductor.skips.descriptions(views, hr_from=hr_from, in_host=True):
         _log.info("Skipped: %s.", phrase)
     for hook, reason in {
         "densifier": "keeps its own density control",
@@ -79,18 +80,9 @@ def warn_without_hr(conductor: Conductor, counts: Mapping[str, int], known: int 
     Args:
         counts: `Attachment.counts`. known: `last_error` before the loop.
     """
-    first = _first_hr(conductor)
-    is_short = first is not None and 0 < counts["merges"] < first and not counts["HR renders"]
+    start, merges = conductor.objective.lambda_hr.zero_until, counts["merges"]
+    is_short = start is not None and 0 < merges <= start and not counts["HR renders"]
     if is_short and last_error() in (None, known):
         _log.warning(
-            "HR took no part in the %d steps of this loop: it would from step %d on. %s",
-            counts["merges"],
-            first,
-            _STRETCH,
+            "HR took no part in the %d steps of this loop: it would after step %d. %s", merges, start, _STRETCH
         )
-
-
-def _first_hr(conductor: Conductor) -> int | None:
-    """The first iteration in which HR takes part in the gradient; None: in none."""
-    λ = conductor.objective.lambda_hr
-    return λ.start + 1 if λ.peak > 0 else λ.decay_from + 1 if λ.final > 0 else None

@@ -19,6 +19,14 @@ def test_lambda_hr_by_the_papers_milestones_and_the_position_rate():
     assert [rate(0), rate(5000), rate(10_000)] == pytest.approx([1.6e-4, 1.6e-5, 1.6e-6])
 
 
+@pytest.mark.parametrize("weights", [(1, 1), (1, 0), (0, 1), (0, 0)])
+@pytest.mark.parametrize("times", [(0, 0, 5, 10), (3, 5, 7, 9), (3, 3, 3, 9), (3, 3, 3, 4), (3, 3, 3, 3)])
+def test_where_lambda_is_first_above_0(weights, times):
+    peak, final = weights
+    schedule = WarmupDecay(peak, final, "linear", *times)
+    assert schedule.zero_until == next((t for t in range(20) if schedule(t + 1) > 0), None)
+
+
 def test_milestones_stretch_with_the_run_and_nothing_else_does():
     short = scaled(Objective(lambda_hr=WarmupDecay(final=0.1)), 0.1)
     assert milestones(short) == {

@@ -104,27 +104,25 @@ class Conductor(Hooks):
     @property
     def uses_hr(self) -> bool:
         """True if HR has any use in some iteration, see `wants_hr`."""
-        λ = self.objective.lambda_hr
-        return λ.peak > 0 or λ.final > 0 or not self.wants_lr or self.owner("score") is not None
+        return self.hr_from() is not None
 
-    @property
-    def hr_from(self) -> int | None:
+    def hr_from(self, *, scored: bool = True) -> int | None:
         """The iteration after which HR may have a use, see `wants_hr`; None: it has none in any."""
-        if not self.uses_hr:
-            return None
         if not self.wants_lr:
             return 0
-        start, collecting = self.objective.lambda_hr.start, self.statistics_from
-        return start if collecting is None or self.owner("score") is None else min(start, collecting)
+        starts = [self.objective.lambda_hr.zero_until]
+        if scored and self.owner("score") is not None:
+            starts.append(self.statistics_from)
+        return min((t for t in starts if t is not None), default=None)
 
     def wants_hr(self, t: int, *, scored: bool = True) -> bool:
         """Return True if the HR render is used at t: λ_HR > 0, Î_LR is its area mean, or a densification score needs it.
 
         Args:
-            scored: False: no densification reads the scores of this iteration, so that `skips.hr_every` may leave HR out.
+            scored: False: no densification reads the scores of this iteration; `skips.hr_every` may leave HR out then.
         """
         if self.objective.lambda_hr(t) == 0 and self.wants_lr:
-            collecting = self.statistics_from is not None and t > self.statistics_from
+            collecting = scored and self.statistics_from is not None and t > self.statistics_from
             if self.owner("score") is None or not collecting or not self.may_densify(t):
                 self.work_log.skip("render LR + HR", "lambda_HR = 0")
                 return False

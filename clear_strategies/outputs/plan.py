@@ -123,19 +123,19 @@ def _table(lines: Mapping[str, str]) -> str:
 
 def _skipped(state: TrainState) -> Iterator[str]:
     """Phrases for the work that this configuration never does."""
-    objective, hr = state.conductor.objective, state.conductor.objective.lambda_hr
+    objective, hr_from = state.conductor.objective, state.conductor.hr_from()
     if not state.conductor.wants_lr:
         used = "is the area mean of the HR render" if objective.lambda_lr > 0 else "plays no part"
         yield f"LR render (LR {used})"
     if objective.lambda_hf == 0:
         yield "high-frequency loss (lambda_hf = 0)"
-    if hr.peak == hr.final == 0:
+    if hr_from is None:
         yield "HR scale throughout (lambda_HR = 0)"
-    elif hr.start > 0:
-        yield f"HR scale until iteration {hr.start} (lambda_HR = 0)"
+    elif hr_from > 0:
+        yield f"HR scale until iteration {hr_from} (lambda_HR = 0)"
     if state.mip.variance == 0:
         yield "3D filter (variance 0)"
-    yield from state.conductor.skips.descriptions(state.views, hr_from=state.conductor.hr_from)
+    yield from state.conductor.skips.descriptions(state.views, hr_from=hr_from)
 
 
 def _marks(state: TrainState) -> dict[str, int]:

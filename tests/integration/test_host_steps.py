@@ -482,6 +482,19 @@ def test_hr_is_left_out_of_every_second_step_but_where_a_densifier_reads_its_sco
     assert widths == {24, 48}
 
 
+def test_a_densifier_without_a_threshold_needs_no_hr_before_the_gradient_does(caplog):
+    caplog.set_level("INFO")
+    late = WarmupDecay(peak=0, start=0, full=0, decay_from=4, end=4)
+    conductor = Conductor(
+        P2G(patch=4), objective=Objective(lambda_hr=late), statistics_from=0, skips=Skips(coarse_until=3)
+    )
+    host, clear, _ = started(conductor=conductor)
+    assert "HR takes part after step 4" in caplog.text
+    assert "skips.coarse_until has no effect" in caplog.text
+    host.train([*host.photos] * 2)
+    assert (clear.attachment.counts["merges"], clear.attachment.counts["HR renders"]) == (6, 2)
+
+
 @pytest.mark.parametrize("fails", ["by itself", "before it is removed"])
 def test_a_loop_that_an_error_ends_is_not_told_of_its_length(fails, caplog, monkeypatch):
     gc.collect()  # of earlier tests, whose attachments tell it when they are freed
@@ -522,14 +535,14 @@ def test_what_an_earlier_error_holds_is_freed():
 def test_a_loop_that_ends_before_hr_takes_part_is_told(caplog):
     caplog.set_level("INFO")
     host, clear, _ = started(conductor=composed_conductor("gco"), iterations=120)
-    assert "HR takes part from step 501 on" in caplog.text
-    assert "501 on, but the loop has 120 steps. Make the conductor for the length of the loop" in caplog.text
+    assert "HR takes part after step 500" in caplog.text
+    assert "500, but the loop has 120 steps. Make the conductor for the length of the loop" in caplog.text
     host.train(host.photos)
     clear.remove()
-    assert "HR took no part in the 3 steps of this loop: it would from step 501 on" in caplog.text
+    assert "HR took no part in the 3 steps of this loop: it would after step 500" in caplog.text
     caplog.clear()
     started(conductor=composed_conductor("gco", iterations=120), iterations=120)
-    assert "HR takes part from step 7 on" in caplog.text
+    assert "HR takes part after step 6" in caplog.text
     assert "the loop has" not in caplog.text
 
 

@@ -705,7 +705,10 @@ def test_a_scale_that_the_objective_needs_is_asked_for_and_hr_only_while_it_has_
     never = Conductor(objective=Objective(lambda_hr=WarmupDecay(peak=0, final=0)))
     assert not any(never.wants_hr(t) for t in range(0, 10_000, 100))
     assert [c.uses_hr for c in (plain, scoring, never)] == [True, True, False]
-    assert [c.hr_from for c in (plain, scoring, never)] == [10, 5, None]
+    late = Conductor(objective=Objective(lambda_hr=WarmupDecay(peak=0, final=1)), statistics_from=5)
+    assert [c.hr_from() for c in (plain, scoring, late, never)] == [10, 5, 5_000, None]
+    assert scoring.hr_from(scored=False) == 10
+    assert [scoring.wants_hr(t, scored=False) for t in (6, 10, 11)] == [False, False, True]
     assert all(
         Conductor(*s, objective=replace(never.objective, lr_from=f)).uses_hr for s, f in [([P2G()], "lr"), ([], "hr")]
     )

@@ -67,7 +67,8 @@ def test_a_strategy_without_effect_is_warned_of(caplog: pytest.LogCaptureFixture
         found = lines(started(GCO(), P2G(), lambda_hr=idle), "gco", "p2g")
         for name in ("GCO", "P2G"):
             assert f"{name} has no effect: lambda_HR is 0 throughout." in caplog.text
-    assert "HR scale throughout (lambda_HR = 0)" in found["skipped"]
+    assert "HR scale until iteration 500 (lambda_HR = 0)" in found["skipped"]  # P2G's score needs it then
+    assert "HR scale throughout (lambda_HR = 0)" in lines(started(GCO(), lambda_hr=idle), "gco")["skipped"]
 
 
 def test_the_progress_bar_counts_iterations(capsys: pytest.CaptureFixture[str]) -> None:
