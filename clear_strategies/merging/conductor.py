@@ -188,6 +188,7 @@ class Conductor(Hooks):
         reduced = not self.wants_lr or (lr is None and view.factor == 1)
         rendered = hr if reduced else lr
         if rendered is None:
+        self.logs.begin(t)
             raise ValueError(
                 f"this objective needs the {'HR' if reduced else 'LR'} scale at t={t}, got None. Render what wants_lr "
                 "and wants_hr(t) ask for."

@@ -68,7 +68,7 @@ class Hooks:
         showing: the strategies that override `extra_views`.
         views: the argument of `on_fit_start`.
         run: what the strategies know of the run, which `on_fit_start` begins; None before it.
-        logs: the scalars that the strategies log.
+        logs: the scalars that the strategies have logged in this iteration, which begins with `gate` or `Conductor.gradients`.
         work_log: which work was done, and which was skipped.
 
     Raises:
@@ -132,6 +132,7 @@ class Hooks:
     @apart_from_the_loop
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | Float[Tensor, "2 N"] | None:
         """zᵗ, before render; None: every Gaussian takes part."""
+        self.logs.begin(t)
         s = self._answering["gate"]
         z = s.gate(t, n)
         if z is None:

@@ -10,17 +10,20 @@ from clear_strategies.strategies.base import Logged, Strategy, by_class
 
 
 class IterationLogs:
-    """The scalars that the strategies have logged since `forget`, including those that `keep` took out of `Strategy.logs`."""
+    """The scalars that the strategies have logged in an iteration, including those that `keep` took out of `Strategy.logs`."""
 
     def __init__(self, strategies: Sequence[Strategy]) -> None:
         self._strategies = strategies
         self._kept: list[dict[str, Logged]] = [{} for _ in strategies]
+        self._t: int | None = None
 
-    def forget(self) -> None:
-        """Begin an iteration: drop the scalars of the last one."""
-        self.keep()
-        for kept in self._kept:
-            kept.clear()
+    def begin(self, t: int) -> None:
+        """Drop the scalars of an earlier iteration than t."""
+        if t != self._t:
+            self._t = t
+            self.keep()
+            for kept in self._kept:
+                kept.clear()
 
     def keep(self) -> None:
         """Take all scalars out of `Strategy.logs`, which then hold only what is logged from now on."""

@@ -45,12 +45,11 @@ EXTRA_LOSS: Final = "loss_extra"
 def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
     """One iteration, in the paper's order."""
     t, θ, conductor, stage = s.t, s.field, s.conductor, s.conductor.work_log.stage
-    conductor.logs.forget()
     θ.degree = min(s.settings.max_degree, (t - 1) // max(1, s.settings.degree_every))
     view = conductor.skips.view(view_at(s), t)
+    z, background = conductor.gate(t, len(θ)), conductor.background(t)  # zᵗ             Eq. 15       SVS
     hr_due = conductor.wants_hr(t, scored=s.density.collects(t))
     scales = {"lr": conductor.lr_due(view, hr_due), "hr": hr_due}
-    z, background = conductor.gate(t, len(θ)), conductor.background(t)  # zᵗ             Eq. 15       SVS
     step, row = learn(s, rasterizer, ViewInputs(t, view, scales, z, background))
     conductor.draw(t, θ.means.data, partial(enlarged, s, rasterizer, background))
     extra = extra_steps(s, rasterizer, conductor.extra_views(t), background)

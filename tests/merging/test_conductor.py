@@ -358,6 +358,7 @@ class LogsShare(Strategy):
 
 def test_what_two_strategies_of_one_class_log_and_add_is_both_there_until_the_next_iteration():
     conductor, params = Conductor(LogsShare(0.25), LogsShare(torch.tensor(0.5))), {"means": torch.tensor([[4.0, 0, 0]])}
+    conductor.gate(1, 1)
     assert conductor.regularized(params, 1)["means"].tolist() == [[3, 0, 0]]
     conductor.logs.keep()
     assert not any(s.logs for s in conductor.strategies)
@@ -365,7 +366,9 @@ def test_what_two_strategies_of_one_class_log_and_add_is_both_there_until_the_ne
     with pytest.raises(AnswerError, match="a strategy logs 'share', a column that the row has already"):
         conductor.logs.scalars({"t", "share"})  # else it would take the place of a loss, say
     conductor.regularized(params, 1)
-    conductor.logs.forget()
+    conductor.gate(1, 1)
+    assert conductor.logs.scalars()
+    conductor.gate(2, 1)
     assert not conductor.logs.scalars()
     with pytest.raises(AnswerError, match=r"LogsShare.log\('share', …\) takes one number, got a tensor \[2\]"):
         LogsShare(torch.ones(2)).regularize({}, 1)
@@ -755,7 +758,6 @@ def test_conflict_is_measured_before_correction_and_what_was_logged_belongs_to_i
     conductor = Conductor(P2G(), objective=Objective(lambda_hr=ALWAYS))
     conductor.update(field.raw(), lr, hr, view, 5)
     assert {"mean_q", "mean_w"} <= conductor.logs.scalars().keys()
-    conductor.logs.forget()
     conductor.update(field.raw(), lr, None, view, 6)
     assert not conductor.logs.scalars()
     assert conductor.work_log.entries["backward HR"].skipped == {"HR was not drawn": 1}
