@@ -143,19 +143,23 @@ class Conductor(Hooks):
             return False
         return self.wants_lr
 
-    def update(self, params: Mapping[str, Tensor], lr: Shot | None, hr: Shot | None, view: View, t: int) -> Update:
+    def update(
+        self, params: Mapping[str, Tensor], lr: Shot | None, hr: Shot | None, view: View, t: int, *,
+        scored: bool = True, looked_up: Tensor | None = None,
+    ) -> Update:  # fmt: skip
         """The merged gradient of one view, in place of `backward()`.
 
         Args:
             params: raw parameters by attribute. lr, hr: this view rendered at both scales. hr None skips HR; lr None
                 stands for the area mean of hr, where `wants_lr` is False or both scales have one size.
+            scored, looked_up: see `gradients`.
 
         Raises:
             ValueError: a scale that the objective needs was not rendered.
             StrategyConflict: one of the strategies has begun the run of another conductor.
             DivergedError: a loss or a gradient is not finite; `params` and the optimizer are unchanged.
         """
-        g_lr, from_hr, update = self.gradients(params, lr, hr, view, t)
+        g_lr, from_hr, update = self.gradients(params, lr, hr, view, t, scored=scored, looked_up=looked_up)
         with self.work_log.stage("strategies"):
             g_hr = Grads() if from_hr is None else from_hr.routed
             merged = self.merge(params, g_lr, g_hr, update.step, t, finite=True)
@@ -184,11 +188,11 @@ class Conductor(Hooks):
             looked_up: see `Step.looked_up`.
         """
         self.require_run(self.run)
+        self.logs.begin(t)
         stage, vjp = self.work_log.stage, vjp or _vjp
         reduced = not self.wants_lr or (lr is None and view.factor == 1)
         rendered = hr if reduced else lr
         if rendered is None:
-        self.logs.begin(t)
             raise ValueError(
                 f"this objective needs the {'HR' if reduced else 'LR'} scale at t={t}, got None. Render what wants_lr "
                 "and wants_hr(t) ask for."

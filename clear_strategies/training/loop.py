@@ -18,7 +18,7 @@ from clear_strategies import files
 from clear_strategies.core import deferred, images
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite
-from clear_strategies.core.gradients import Grads, conflict_columns
+from clear_strategies.core.gradients import conflict_columns
 from clear_strategies.core.seeds import generator_at
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, Photo, View
@@ -80,18 +80,17 @@ def learn(s: TrainState, rasterizer: Rasterizer, inputs: ViewInputs) -> tuple[St
         )
     params, compiled, scored = θ.raw(), s.compiled_step, s.density.collects(t)
     *_, finest = (shot for shot in (lr, hr) if shot is not None)
-    g_lr, from_hr, u = conductor.gradients(
-        params, lr, hr, view, t, None if compiled is None else FieldShot.gradients, scored=scored,
-        weights=None if compiled is None else compiled.weights(t), looked_up=inputs.looked_up,
-    )  # fmt: skip
     if compiled is None:
-        with stage("strategies"):
-            g_hr = Grads() if from_hr is None else from_hr.routed
-            grads, conflict, _ = conductor.merge(params, g_lr, g_hr, u.step, t, finite=True)
+        u = conductor.update(params, lr, hr, view, t, scored=scored, looked_up=inputs.looked_up)
+        conflict = u.conflict
         with stage("optimizer"):
-            s.optimizer.step(params, grads)
+            s.optimizer.step(params, u.grads or {})
             θ.constrain()
     else:
+        g_lr, from_hr, u = conductor.gradients(
+            params, lr, hr, view, t, FieldShot.gradients, scored=scored, weights=compiled.weights(t),
+            looked_up=inputs.looked_up,
+        )  # fmt: skip
         with stage("per-Gaussian pass"):  # the same in one
             conflict = compiled.step(params, finest, g_lr, from_hr, t)
     if scored:
