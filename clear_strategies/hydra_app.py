@@ -186,8 +186,7 @@ class SweepCallback(Callback):
     """Runs at the beginning and end of a sweep, in the process that was started; jobs may run in other processes."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        sweep.leave_out_what_methods_set_aside(config)
-        if refusal := sweep.refusal(config):
+        if refusal := sweep.leave_out_what_methods_set_aside(config) or sweep.refusal(config):
             _log.error("%s", refusal)  # of an error that a callback raises Hydra makes a warning
             sys.exit(exit_codes.UNUSABLE)
         signals.handle(sweep.stop_workers)

@@ -68,18 +68,21 @@ def refusal(config: DictConfig) -> str | None:
         return None  # Hydra, which composes all jobs next, or the jobs raise the error
 
 
-def leave_out_what_methods_set_aside(config: DictConfig) -> None:
+def leave_out_what_methods_set_aside(config: DictConfig) -> str | None:
     """Sweep no strategies that each method of the sweep sets aside: the jobs of one method would all be the same run.
 
     Args:
         config: as of `refusal`.
+
+    Returns:
+        The reason why the sweep cannot begin: only some of its methods set the strategies aside; else None.
     """
     if config.hydra.runtime.choices["hydra/sweeper"] != "basic":  # others may have no `params`
-        return
+        return None
     words = {word.key_or_group: word for word in _words(config)}
     strategy, method = words.get("strategy"), words.get("method")
     if strategy is None or method is None or not strategy.is_sweep_override():
-        return
+        return None
     of_strategy, of_method = (f"{word.get_key_element()}=" for word in (strategy, method))
     baseline, jobs = f"{of_strategy}baseline", dict[str, list[str]]()  # a job of each method, with another strategy
     for job in _overrides_of_jobs(config):
@@ -91,9 +94,16 @@ def leave_out_what_methods_set_aside(config: DictConfig) -> None:
         return bool(_strategies_of(config, job) == _strategies_of(config, alone))
 
     with suppress(HydraException, OmegaConfBaseException):  # Hydra, which composes all jobs next, raises the error
-        if all(map(is_set_aside, jobs.values())):
+        aside = [method for method, job in jobs.items() if is_set_aside(job)]
+        if len(aside) == len(jobs):
             with read_write(config.hydra):  # of one key the last counts
                 config.hydra.overrides.task.append(baseline)
+        elif aside and _has_default_folders(config):
+            return (
+                f"{aside[0]}: sets strategies aside, so that this sweep would train it once for each of them, in one folder. "
+                f"Sweep it by a command of its own, without {of_strategy}…; both may have one hydra.sweep.dir."
+            )
+    return None
 
 
 def name_by_all_that_is_swept(config: DictConfig) -> None:

@@ -126,10 +126,6 @@ def test_a_sweep_whose_jobs_do_not_all_lack_the_same_begins_and_goes_on_after_a_
             ["+method=srgs,splatsure", "+strategy=gco,svs"],
             [f"+method={m},+strategy={s}" for m in ("srgs", "splatsure") for s in ("gco", "svs")],
         ),
-        (
-            ["+strategy=gco,svs", "+method=srgs,[]"],
-            ["+method=srgs"] * 2 + [f"+method=[],+strategy={s}" for s in ("gco", "svs")],
-        ),
     ],
 )
 def test_the_folders_of_a_sweeps_jobs_are_named_by_all_in_which_they_differ(asked, folders, monkeypatch):
@@ -208,6 +204,15 @@ def test_strategies_stay_in_a_sweep_of_a_method_of_ones_own_that_keeps_them(tmp_
     sweep.leave_out_what_methods_set_aside(config)
     jobs = sweep._overrides_of_jobs(config)
     assert [job[0] for job in jobs] == [f"+strategy={name}" for name in ("baseline", "gco", "svs")]
+
+
+def test_a_sweep_in_which_one_method_of_several_sets_strategies_aside_is_refused(tmp_path):
+    """Its jobs of this method would be one run in one folder."""
+    words = ["-m", "+strategy=gco,svs", "+method=srgs,[]", *TINY]
+    result = run(*words, cwd=tmp_path)
+    assert result.returncode == 2
+    assert result.stdout.startswith("error: +method=srgs: sets strategies aside"), result.stdout
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_sweep_that_is_stopped_between_two_jobs_tells_how_to_go_on(monkeypatch, caplog):
