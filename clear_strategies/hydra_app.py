@@ -78,9 +78,10 @@ def main(overrides: Sequence[str] | None = None) -> None:
         raise not_composed(error, overrides, "config") from error
     except BrokenProcessPool as error:
         raise sweep.worker_ended(error) from error
-    except KeyboardInterrupt:  # between two jobs
-        for folder in _begun:
-            _tell_how_to_go_on(folder)
+    except (KeyboardInterrupt, SystemExit) as end:
+        if getattr(end, "code", None) != exit_codes.UNUSABLE:  # the sweep has not come to its end
+            for folder in map(shlex.quote, (f"hydra.sweep.dir={folder}" for folder in _begun)):
+                _log.info("Go on with the sweep by the same command with %s fit.resume=auto.", folder)
         raise
 
 
@@ -171,15 +172,7 @@ def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resum
         if sweep.in_worker():
             signals.told.append(signum)
             return
-        if sweep.in_sweep():
-            _tell_how_to_go_on(HydraConfig.get().sweep.dir)
     sys.exit(code)
-
-
-def _tell_how_to_go_on(folder: str) -> None:
-    _log.info(
-        "Go on with the sweep by the same command with %s fit.resume=auto.", shlex.quote(f"hydra.sweep.dir={folder}")
-    )
 
 
 class SweepCallback(Callback):
@@ -197,7 +190,6 @@ class SweepCallback(Callback):
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         if signals.told:
-            _tell_how_to_go_on(config.hydra.sweep.dir)
             sys.exit(exit_codes.SIGNALS + signals.told[0])
         folder = Path(config.hydra.sweep.dir)
         _report(folder)
