@@ -48,6 +48,10 @@ def check_rasterizer(make: Make, *, reference: bool = True) -> None:
     Raises:
         ContractError: from the first check that fails.
     """
+    members, rasterizer = ("traits", "__call__", "render_scales"), make()
+    missing = [name for name in members if not hasattr(rasterizer, name)]
+    remedy = "Derive it from rasterizers.backend.Backend, and implement traits and draw"
+    require(not missing, f"a rasterizer has {', '.join(members)}, but this one has no {', '.join(missing)}. {remedy}")
     for check in CHECKS:
         if reference or inspect.unwrap(check) is not inspect.unwrap(check_agrees_with_the_reference):
             check(make)

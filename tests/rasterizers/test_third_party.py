@@ -86,6 +86,8 @@ class Flat:
 
 def test_third_parties_rasterizers_pass_the_checks_and_are_refused_where_depth_is_asked_of_one_without(caplog):
     check_rasterizer(ThirdParty)
+    with pytest.raises(ContractError, match=r"this one has no traits, render_scales\. Derive it from .*Backend"):
+        check_rasterizer(lambda **_: lambda splats, camera: None)
     target = f"{__name__}.ThirdParty"
     found = instantiate({"_target_": target, "near": 0.01, "background": [1, 1, 1], "lanes_per_pass": 4096})
     assert isinstance(found, Rasterizer)
