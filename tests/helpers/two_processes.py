@@ -39,15 +39,17 @@ class Model(torch.nn.Module):
 def train(rank: int, file: str) -> None:
     """What each of the two does; an error ends both."""
     distributed.init_process_group("gloo", init_method=f"file://{file}", rank=rank, world_size=2)
-    scene = toy.scene(20)
-    model = Model(scene)
-    parallel = DistributedDataParallel(copy.deepcopy(model))
-    ends = [trained(model, model, scene, rank), trained(parallel.module, parallel, scene, rank)]
-    assert all(torch.allclose(mine, theirs, atol=1e-6) for mine, theirs in zip(*ends, strict=True))
-    with pytest.raises(SettingError, match=r"one process, got 2.*Or average the gradients of joint_loss"):
-        gsplat_host.started(GCO(), scene=scene)
-    distributed.barrier()  # neither ends while the other still needs it
-    distributed.destroy_process_group()
+    try:
+        scene = toy.scene(20)
+        model = Model(scene)
+        parallel = DistributedDataParallel(copy.deepcopy(model))
+        ends = [trained(model, model, scene, rank), trained(parallel.module, parallel, scene, rank)]
+        assert all(torch.allclose(mine, theirs, atol=1e-6) for mine, theirs in zip(*ends, strict=True))
+        with pytest.raises(SettingError, match=r"one process, got 2.*Or average the gradients of joint_loss"):
+            gsplat_host.started(GCO(), scene=scene)
+        distributed.barrier()  # neither ends while the other still needs it
+    finally:
+        distributed.destroy_process_group()
 
 
 def trained(model, called, scene, rank):
