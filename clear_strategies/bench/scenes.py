@@ -133,17 +133,16 @@ def from_ply(path: Path) -> Workload:
     return Workload(path.stem, splats, overview(splats.means, splats.opacities))
 
 
-_TAILS: Final = "tails"
 # Gaussians shrink as their number grows, as under densification: the radius is 5.5 px at 100k.
 _GENERATED: Final = {
-    "tiny": (600, 96, 72, 4.0),
-    "small": (5_000, 252, 189, 5.5),
-    "s100k": (100_000, 1008, 756, 5.5),
-    "s500k": (500_000, 1008, 756, 5.5 * 5**-0.3),
-    _TAILS: (60_000, 1008, 756, 1.5),
+    "tiny": (surfaces, 600, 96, 72, 4.0),
+    "small": (surfaces, 5_000, 252, 189, 5.5),
+    "s100k": (surfaces, 100_000, 1008, 756, 5.5),
+    "s500k": (surfaces, 500_000, 1008, 756, 5.5 * 5**-0.3),
+    "tails": (tails, 60_000, 1008, 756, 1.5),
 }
 _AT_LR: Final = "s100k-lr"  # the same Gaussians at a quarter of the image size
-NAMES: Final = ("tiny", "small", "s100k", _AT_LR, "s500k", _TAILS)
+NAMES: Final = ("tiny", "small", "s100k", _AT_LR, "s500k", "tails")
 
 
 def load(name: str) -> Workload:
@@ -152,8 +151,8 @@ def load(name: str) -> Workload:
         hr = load("s100k")
         return Workload(name, hr.splats, hr.camera.scaled(1 / 4))
     if name in _GENERATED:
-        n, width, height, radius = _GENERATED[name]
-        return (tails if name == _TAILS else surfaces)(name, n, width, height, radius=radius)
+        generate, n, width, height, radius = _GENERATED[name]
+        return generate(name, n, width, height, radius=radius)
     if Path(name).is_file():
         return from_ply(Path(name))
     raise DataError("--scene", name, "is no scene and no file", f"choose one of {', '.join(NAMES)}, or give a .ply")

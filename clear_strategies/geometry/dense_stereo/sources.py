@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core.view import Photo
-from clear_strategies.geometry.cameras import centers_of, common_box
+from clear_strategies.geometry.cameras import centers_of, looked_at
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.projection import (
     back_project,
@@ -50,8 +50,7 @@ def comparisons(photos: Sequence[Photo], points: Float[Tensor, "N 3"], most: int
     Args:
         points: of the surfaces, world units; for a photo that sees few, depths are guessed from the cameras.
     """
-    low, high = common_box(photos)
-    middle = (low + high)[None] / 2
+    middle = looked_at([photo.camera for photo in photos])[None].float()
     cameras = _Cameras([photo.camera for photo in photos])
     compared = []
     for i, photo in enumerate(photos):
