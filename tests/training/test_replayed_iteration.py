@@ -54,7 +54,7 @@ def start(
     iterations: int = 250,
     density: bool = True,
     scene: Scene = SCENE,
-    rises_at: int = 20,
+    rises_at: int | None = None,
     degree_every: int = 75,
     scores_from: int = 1,
     reconciles: cs.Strategy | None = None,
@@ -63,6 +63,8 @@ def start(
     """A training of everything that `best` is made of, over which λ_HR rises and falls, and with an anchor."""
     from clear_strategies.kernels.gaussian_step.warp import WarpGaussianStep
 
+    if rises_at is None:
+        rises_at = 20 if density else 1  # HR takes part from the second iteration on, by its score or by its gradient
     objective = cs.Objective(
         lambda_hr=WarmupDecay(final=0.1, start=rises_at, full=60, decay_from=200, end=250), kernels="warp"
     )
