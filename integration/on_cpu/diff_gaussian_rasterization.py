@@ -5,9 +5,10 @@ A fork is known by its settings, and gets what its own rasterizer returns:
 | settings | trainers | returns |
 |---|---|---|
 | 3DGS's alone | 3DGS before October 2024, DropGaussian | image, radii |
+| the same, and `UNPACKED` names them | Binocular3DGS and others of few views | image, radii, depth [1, H, W], alpha [1, H, W] |
 | `antialiasing` | 3DGS | image, radii, inverse depth [1, H, W] |
 | `kernel_size`, `subpixel_offset` | Mip-Splatting | image, radii |
-| `confidence` | FSGS | image, radii, depth [1, H, W], alpha [1, H, W] |
+| `confidence` | FSGS, NexusGS | image, radii, depth [1, H, W], alpha [1, H, W] |
 
 Depths are sums over a pixel's Gaussians, weighted as their colours are, and differentiable. `means2D.grad` holds the gradient of
 the projected centres in NDC; for Mip-Splatting its third column is Σ (|∂L/∂x| + |∂L/∂y|) over the pixels.
@@ -17,7 +18,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple, cast
 
 import torch
@@ -36,6 +37,9 @@ from rasterizers.reference.projection import footprints
 
 _NEAR: Final = 0.2  # what 3DGS draws begins at this depth
 _KERNEL: Final = 0.3  # its 2D kernel's variance, px²
+_OF_FSGS: Final = ("depth", "alpha")
+UNPACKED: Final = set[tuple[str, ...]]()
+"""The names to which the trainer's renderer unpacks what its rasterizer returns; empty: unknown."""
 
 
 class OwnRasterizerError(HostError, ImportError):
@@ -178,11 +182,22 @@ class GaussianRasterizer(torch.nn.Module):
         image, alpha = view.picture(parts, centres, None, absgrad)
         image = image.permute(2, 0, 1).contiguous()
         radii = _radii(drawn.visible, inputs, camera, kernel)
-        if s.antialiasing is None and s.confidence is None:
-            return image, radii
         z = depths(means3D, pose.to(means3D))[:, None].clamp_min(_NEAR)
-        depth = _sum(rasterizer, camera, inputs, z if s.antialiasing is None else 1 / z)
-        return (image, radii, depth) if s.confidence is None else (image, radii, depth, alpha[None])
+        kinds = _unpacked() if s.antialiasing is s.kernel_size is None else ("inverse",) * (s.antialiasing is not None)
+        more = {
+            "depth": lambda: _sum(rasterizer, camera, inputs, z), "inverse": lambda: _sum(rasterizer, camera, inputs, 1 / z),
+            "alpha": lambda: alpha[None],
+        }  # fmt: skip
+        returned = image, radii, *(more[kind]() for kind in (_OF_FSGS if s.confidence is not None else kinds))
+        if UNPACKED and all(len(names) != len(returned) for names in UNPACKED):
+            raise OwnRasterizerError(f"what it returns ({'; '.join(map(', '.join, sorted(UNPACKED)))})")
+        return returned
+
+
+def _unpacked() -> Sequence[str]:
+    """What a renderer with 3DGS's settings unpacks behind the radii, if these are depths and alphas alone."""
+    found = [["".join(kind for kind in _OF_FSGS if kind in name) for name in names[2:]] for names in UNPACKED]
+    return max((kinds for kinds in found if all(kind in _OF_FSGS for kind in kinds)), key=len, default=())
 
 
 def _gradient_probe(

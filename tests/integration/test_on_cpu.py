@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 
 from clear_strategies.errors import HostError
 from integration.on_cpu import diff_gaussian_rasterization, gsplat_functions
-from integration.on_cpu.__main__ import REFUSED, _knn, _OwnRasterizers
+from integration.on_cpu.__main__ import _UNPACKED, REFUSED, _knn, _OwnRasterizers
 from integration.on_cpu.diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
 from integration.on_cpu.fused_ssim import fused_ssim
 from integration.on_cpu.simple_knn import distances_and_indices
@@ -348,6 +348,32 @@ def test_a_fork_that_needs_its_own_rasterizer_is_told_so(use, named, monkeypatch
     monkeypatch.setattr(sys, "meta_path", [*sys.meta_path, _OwnRasterizers])
     with pytest.raises(HostError, match=f"needs its own CUDA rasterizer, for {named}, and with it a GPU"):
         use()
+
+
+@pytest.mark.parametrize(
+    ("unpacked", "shapes"),
+    [
+        ("rendered_image, radii", []),
+        ("image, radii, depth", [(1, HEIGHT, WIDTH)]),
+        ("rendered_image, radii, rendered_depth,\n        rendered_alpha", [(1, HEIGHT, WIDTH)] * 2),
+        ("rendered_image, radii, pixels", None),
+        ("image, radii, depth, alpha, idx, weights", None),
+    ],
+)
+def test_a_fork_with_3dgss_settings_gets_what_its_renderer_unpacks_or_is_refused(unpacked, shapes, monkeypatch):
+    """Binocular3DGS, SCGaussian; Pixel-GS and LoopSparseGS have rasterizers of their own."""
+    (names,) = _UNPACKED.findall(f"def render():\n    {unpacked} = rasterizer(means3D=means3D)")
+    monkeypatch.setattr(diff_gaussian_rasterization, "UNPACKED", {tuple(name.strip() for name in names.split(","))})
+    draw, given = GaussianRasterizer(settings("dropgaussian")), cloud()
+    if shapes is None:
+        with pytest.raises(HostError, match=f"for what it returns .*{unpacked}.*, and with it a GPU"):
+            draw(**given)
+        return
+    _, _, *more = draw(**given)
+    assert [x.shape for x in more] == shapes
+    of_fsgs = GaussianRasterizer(settings("fsgs"))
+    monkeypatch.setattr(diff_gaussian_rasterization, "UNPACKED", set())
+    assert all(torch.equal(x, y) for x, y in zip(more, of_fsgs(**given)[2:], strict=False))
 
 
 def test_a_fork_may_do_without_what_it_tries_to_import(tmp_path):
