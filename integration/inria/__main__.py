@@ -35,8 +35,7 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
     """CLEAR is installed after the first call of `training_setup` of each model (CoR-GS trains two), for the cameras of the last
     `Scene`.
     """
-    renderer: Any = importlib.import_module("gaussian_renderer")  # whose `render` install replaces
-    scene: Any = importlib.import_module("scene")
+    renderer, scene = _of_trainer("gaussian_renderer"), _of_trainer("scene")  # install replaces `render` of the first
     init, render = scene.Scene.__init__, training_render(renderer)
     of = scene.GaussianModel
     scenes, models, attached = list[Any](), list[Any](), list[Any]()
@@ -48,9 +47,10 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
 
     def installing(setup: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(setup)
-        def setup_and_install(gaussians: Any, opt: Any, *args: Any, **kwargs: Any) -> Any:
-            result = setup(gaussians, opt, *args, **kwargs)
-            if any(model is gaussians for model in models):  # points=stereo, and a restored checkpoint, call it again
+        def setup_and_install(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
+            result, opt = setup(gaussians, *args, **kwargs), next(iter((*args, *kwargs.values())), None)
+            # SCGaussian's of an earlier stage has no options; points=stereo, and a restored checkpoint, set a model up again
+            if opt is None or any(model is gaussians for model in models):
                 return result
             models.append(gaussians)
             if not scenes:
@@ -84,6 +84,17 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
         yield attached
         for each in attached:
             _log.info("%s.", each.attachment.summary())
+
+
+def _of_trainer(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name != name:
+            raise
+        raise HostError(
+            f"{sys.argv[0]} has no module {name} beside it, as in 3DGS. Where it is elsewhere, as in EDGS, set PYTHONPATH."
+        ) from None
 
 
 TRAINER: Final = launcher.Trainer(

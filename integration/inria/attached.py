@@ -93,6 +93,13 @@ class Attached:
                 "gaussians.training_setup(opt). A model whose Gaussians a network computes, as in Scaffold-GS, has none, and its "
                 "trainer does not work."
             )
+        rows = {attribute: len(getattr(gaussians, attribute)) for attribute in _ATTRIBUTES.values()}
+        if len({*rows.values()}) > 1:
+            raise HostError(
+                f"the Gaussians of {type(gaussians).__name__} must be rows of {', '.join(rows)}, got "
+                f"{', '.join(map(str, rows.values()))} rows. A trainer that computes them from other parameters, as SCGaussian "
+                "does their positions, does not work."
+            )
         if "save_ply" in vars(gaussians):
             raise HostError("these gaussians are attached already; remove() the attachment that did it first.")
         require_end(conductor, densify_until, "densify_until_iter")

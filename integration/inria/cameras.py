@@ -18,7 +18,7 @@ from torch import Tensor
 
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import SUFFIXES
-from clear_strategies.errors import SettingError
+from clear_strategies.errors import HostError, SettingError
 from integration.views import HostPhoto, SuperResolve, require_unique
 from rasterizers.interface import Camera
 
@@ -70,8 +70,18 @@ def photo_of(camera: Any, device: torch.device | str = "cpu") -> HostPhoto:
 
     `alpha_mask`, which 3DGS multiplies its rendering by, is the photo's alpha, and with --train_test_exp the half of a test photo
     that stays unseen.
+
+    Raises:
+        HostError: it is drawn at another size.
     """
     image, mask = camera.original_image.permute(1, 2, 0).detach().to(device), getattr(camera, "alpha_mask", None)
+    size, drawn = (image.shape[1], image.shape[0]), (camera.image_width, camera.image_height)
+    if size != drawn:
+        raise HostError(
+            f"{camera.image_name} is drawn at {drawn[0]}x{drawn[1]} pixels, but its photo has {size[0]}x{size[1]}. LR must be "
+            "drawn at the photo's size, beside which HR is drawn here. A trainer that draws at HR, as SRGS does, does not work; "
+            "clear-strategies +method=srgs is its method."
+        )
     shown = None if mask is None or bool((mask == 1).all()) else mask[0].to(image)
     name = camera.image_name  # some hosts drop the ending, also of a name that contains dots
     name = name if Path(name).suffix.lower() in SUFFIXES else f"{name}.png"

@@ -386,8 +386,11 @@ def test_unsupported_calls_are_refused(inria_host, inria_capture, inria_attached
     gaussians._xyz.data = whole
     with pytest.raises(HostError, match="attached already"):
         attach(gaussians, scene.cameras, Conductor(GCO()), sr=inria_capture / "sr")
-    gaussians.optimizer = None
     clear.remove()
+    gaussians._xyz = torch.empty(0)
+    with pytest.raises(HostError, match=f"must be rows of _xyz, .* got 0, {N}, .* as SCGaussian"):
+        attach(gaussians, scene.cameras, Conductor(GCO()), sr=inria_capture / "sr")
+    gaussians.optimizer = None
     with pytest.raises(HostError, match="has no optimizer"):
         attach(gaussians, scene.cameras, Conductor(GCO()), sr=inria_capture / "sr")
 
@@ -408,6 +411,9 @@ def test_views_need_unique_names_and_sr_images_of_the_right_size(inria_host, inr
         attach(gaussians, [scene.cameras[0]] * 2, Conductor(), sr=inria_capture / "sr")
     with pytest.raises(DataError, match="is 96x64 where 48x32 is expected"):
         attach(gaussians, scene.cameras, Conductor(), sr=inria_capture / "sr", factor=2)
+    scene.cameras[0].image_width *= 4  # SRGS draws at HR
+    with pytest.raises(HostError, match="view0 is drawn at 96x16 pixels, but its photo has 24x16"):
+        attach(gaussians, scene.cameras, Conductor(), sr=inria_capture / "sr")
     _, scene = inria_host.setup(options(inria_host, inria_capture))
     expected = projection.intrinsics(toy.scene(N).train[0].lr.camera)
     assert torch.allclose(intrinsics(scene.cameras[0]), expected, atol=1e-4)
@@ -546,6 +552,16 @@ def test_another_method_that_sets_a_model_up_is_known_by_its_name(
     assert inria_host.GaussianModel.training_setup_pp is training_setup_pp
 
 
+def test_a_setup_of_an_earlier_stage_that_takes_no_options_is_the_hosts_own(
+    inria_host, inria_launched, caplog, monkeypatch
+):
+    """SCGaussian's, of an optimizer before the Gaussians are made."""
+    monkeypatch.setattr(inria_host.GaussianModel, "training_setup_init", lambda self: None, raising=False)
+    change = SETUP, f"gaussians.training_setup_init()\n    {SETUP}"
+    assert inria_launched("--iterations", "4", change=change) == 0
+    assert "4 merges" in caplog.text
+
+
 def test_a_model_that_would_train_without_the_strategies_is_refused_at_its_first_rendering(
     inria_host, inria_launched, caplog, monkeypatch
 ):
@@ -553,6 +569,12 @@ def test_a_model_that_would_train_without_the_strategies_is_refused_at_its_first
     assert inria_launched(change=(SETUP, "gaussians.own_setup(opt)")) == 2
     assert "GaussianModel would train without CLEAR" in caplog.text
     assert not hasattr(inria_host.render, "__wrapped__")
+
+
+def test_a_train_py_without_a_renderer_beside_it_is_refused(inria_capture, caplog):
+    (inria_capture / "train.py").write_text("")
+    assert main(["--sr", str(inria_capture / "sr"), str(inria_capture / "train.py")]) == 2
+    assert "has no module gaussian_renderer beside it" in caplog.text
 
 
 def test_a_train_py_that_trains_nothing_is_an_error(inria_capture, inria_host, caplog):
