@@ -216,7 +216,8 @@ class Pending:
             raise HostError(
                 "one backward pass reaches two renderings of training views, but each is merged by itself. With several views "
                 "for a step, call backward() after each rendering (see accumulation=), or use joint_loss. For a second pass "
-                "over the same view, call the function that was wrapped, its __wrapped__."
+                "over the same view, and for a view that is compared with no photo, call the function that was wrapped, its "
+                "__wrapped__."
             )
         raise HostError(
             f"a backward pass reaches an earlier rendering than that of {self.view}, but only the last can be merged. Call "
