@@ -85,6 +85,7 @@ def prepared(script: Path, arguments: Sequence[str] = ()) -> launcher.Trainer:
     }  # fmt: skip
     sources = [] if renderer is None else [file.read_text(encoding="utf-8") for file in renderer.glob("*.py")]
     unpacked = [names for source in sources for names in _UNPACKED.findall(source)]
+    diff_gaussian_rasterization.UNPACKED.clear()
     diff_gaussian_rasterization.UNPACKED.update(tuple(name.strip() for name in names.split(",")) for names in unpacked)
     draws_with_gsplat = renderer is None or any("gsplat" in source for source in sources)
     if draws_with_gsplat and importlib.util.find_spec("gsplat") is not None:
