@@ -1,14 +1,13 @@
 """What CUDA, torch and Warp refuse of streams and graphs: the list by which `strict_cuda` stands in for a GPU.
 
-A fault that is found on a GPU becomes a rule here first. Each docstring is the error's message, and says who refuses; without a
-name it is the CUDA runtime. What it refuses in a capture makes that capture invalid; where the source does not say so, too.
+A fault that is found on a GPU becomes a rule here first.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 
 @dataclass
@@ -67,199 +66,135 @@ class State:
         return self.capture is not None and self.capture.stream is stream
 
 
-Rule = Callable[[Act, State], bool]
-RULES: Final[list[Rule]] = []
-CHECKS: Final[list[Rule]] = []
-"""Those that torch checks before CUDA hears of it, so that a capture goes on."""
+class Rule(NamedTuple):
+    """A refusal.
 
-
-def rule(refuses: Rule) -> Rule:
-    RULES.append(refuses)
-    return refuses
-
-
-def check(refuses: Rule) -> Rule:
-    CHECKS.append(refuses)
-    return rule(refuses)
-
-
-# The first fault that a GPU showed.
-@check
-def pool_before_the_end(a: Act, _: State) -> bool:
-    """Called CUDAGraph::pool() without a preceding successful capture (torch)."""
-    return a.what == "pool" and not a.graph.captured
-
-
-@check
-def replay_before_the_end(a: Act, _: State) -> bool:
-    """Called CUDAGraph::replay without a preceding successful capture (torch)."""
-    return a.what == "replay" and not a.graph.captured
-
-
-@check
-def begin_on_the_default_stream(a: Act, s: State) -> bool:
-    """CUDA graphs must be captured on a non-default stream (torch)."""
-    return a.what == "begin" and a.on is s.legacy
-
-
-@check
-def begin_of_a_graph_that_is_captured(a: Act, _: State) -> bool:
-    """This CUDAGraph instance already owns a captured graph (torch)."""
-    return a.what == "begin" and a.graph.captured
-
-
-@rule
-def second_begin(a: Act, s: State) -> bool:
-    """Operation not permitted: a capture is under way already."""
-    return a.what == "begin" and s.capture is not None
-
-
-@rule
-def end_without_begin(a: Act, s: State) -> bool:
-    """Operation failed: this graph is not being captured, or not on this stream (torch, CUDA)."""
-    return a.what == "end" and not (s.capture is a.graph and s.captures(a.on))
-
-
-# The second fault that a GPU showed.
-@check
-def a_stream_before_warp_begins(a: Act, s: State) -> bool:
-    """'NoneType' object has no attribute 'cuda_devices' (Warp's stream_from_torch, before `warp.init`)."""
-    return a.what == "warp stream" and not s.warp_runs
-
-
-@rule
-def warp_joins_what_is_captured(a: Act, s: State) -> bool:
-    """External capture reported, but the stream is not capturing (Warp's capture_begin)."""
-    return a.what == "warp begin" and not s.captures(a.on)
-
-
-@rule
-def warp_ends_what_it_began(a: Act, s: State) -> bool:
-    """Graph capture is not active on this stream (Warp's capture_end)."""
-    return a.what == "warp end" and not s.warp_knows
-
-
-@rule
-def sort_that_warp_does_not_know_of(a: Act, s: State) -> bool:
-    """Allocating a temporary sort buffer during unregistered graph capture (Warp; a warning, and the memory leaks)."""
-    return a.what == "sort" and s.capture is not None and not s.warp_knows
-
-
-@rule
-def waiting_for_the_device(a: Act, s: State) -> bool:
-    """Operation not permitted when stream is capturing: the host waits, to read numbers or to know how many there are."""
-    return a.what == "read" and s.capture is not None
-
-
-@rule
-def pinning_memory(a: Act, s: State) -> bool:
-    """Operation not permitted when stream is capturing: cudaHostAlloc, in the modes global and thread_local, and the query of
-    an event that precedes it (of a torch whose pinned memory has no pools of graphs).
+    Args:
+        of: what the acts do that it is about, "" for any. refuses: whether it refuses one of them.
+        message: of the error; it says who refuses, without a name the CUDA runtime.
+        check: whether torch checks it before CUDA hears of it, so that a capture goes on. What else is refused in a capture makes
+            that capture invalid; where the source does not say so, too.
     """
-    return a.what == "pin" and s.capture is not None
+
+    of: str
+    refuses: Callable[[Act, State], bool]
+    message: str
+    check: bool = False
 
 
-@rule
-def freeing_pinned_memory(a: Act, s: State) -> bool:
-    """Operation not permitted on an event last recorded in a capturing stream: torch records one where pinned memory is freed, on
-    each stream that has copied it, and asks for it whenever it pins memory later (CachingHostAllocatorImpl::free).
-    """
-    return a.what == "unpin" and s.captures(a.on)
+def capturing(a: Act, s: State) -> bool:
+    return s.capture is not None
 
 
-@check
-def sending_where_waits_are_refused(a: Act, s: State) -> bool:
-    """Called a synchronizing CUDA operation: a copy from memory that is not pinned, as of `new_tensor` (torch, after
-    `set_sync_debug_mode("error")`; of reads outside of a capture it is not known here which are of the device).
-    """
-    return a.what == "send" and s.no_waits
-
-
-@rule
-def sending_numbers_of_python(a: Act, s: State) -> bool:
-    """Operation not permitted when stream is capturing: a copy from memory that is not pinned, as of torch.tensor."""
-    return a.what == "send" and s.capture is not None
-
-
-@rule
-def allocating_outside_the_pool(a: Act, s: State) -> bool:
-    """Operation not permitted when stream is capturing: cudaMalloc, by Warp or by torch on a stream that is not captured."""
-    return a.what == "allocate" and s.capture is not None and (a.by_warp or not s.captures(a.on))
-
-
-@check
-def allocating_beside_what_is_cached(a: Act, s: State) -> bool:
-    """CUDA out of memory: torch gives cached memory back only where no capture is underway (alloc_block in its allocator)."""
-    return a.what == "allocate" and s.capture is not None and s.living + s.cached > ROOM
-
-
-@check
-def emptying_the_cache_in_a_capture(a: Act, s: State) -> bool:
-    """captures_underway.empty() INTERNAL ASSERT FAILED (torch, also after a capture that CUDA has ended by an error: see
-    CUDAGraph::capture_end, whose endAllocateToPool comes after the check of cudaStreamEndCapture).
-    """
-    return a.what == "empty" and bool(s.underway)
-
-
-@check
-def random_numbers_after_a_failed_capture(a: Act, s: State) -> bool:
-    """Offset increment outside graph capture encountered unexpectedly (torch: a capture that CUDA has ended by an error leaves
-    the generator as within it; torch 2.13 has a state for each capture).
-    """
-    return a.what == "random" and s.capture is None and s.seeds
-
-
-@rule
-def timing_in_a_capture(a: Act, s: State) -> bool:
-    """Operation not permitted on an event last recorded in a capturing stream: it has no time, and cannot be asked for one."""
-    return a.what == "event" and s.captures(a.on)
-
-
-@rule
-def destroying_a_graph(a: Act, s: State) -> bool:
-    """Operation not permitted when stream is capturing: cudaGraphExecDestroy, where torch does not relax the mode for it."""
-    return a.what == "destroy" and s.capture is not None
-
-
-@check
-def a_graph_of_autograd_on_another_stream(a: Act, _: State) -> bool:
-    """The AccumulateGrad node's stream does not match the stream of the node that produced the incoming gradient (torch from
-    2.10 on; a warning, and each backward pass waits).
-    """
-    return a.what == "graph" and bool(a.on.records)
-
-
-@rule
-def loading_a_module(a: Act, s: State) -> bool:
-    """Operation not permitted when stream is capturing: cuModuleLoadData, by drivers before CUDA 12.3 (Warp's capture_begin)."""
-    return a.what == "load" and s.capture is not None
-
-
-@rule
-def waiting_for_a_capturing_stream(a: Act, s: State) -> bool:
-    """Operation would make the legacy stream depend on a capturing blocking stream."""
-    return a.what == "wait" and s.captures(a.other)
-
-
-@rule
-def a_capturing_stream_waiting(a: Act, s: State) -> bool:
-    """Dependency created on uncaptured work in another stream."""
-    return a.what == "wait" and s.captures(a.on)
-
-
-@rule
-def work_on_another_stream(a: Act, s: State) -> bool:
-    """Operation on a stream that is not captured: refused on the default stream, and missing from the graph on others."""
-    return a.what in ("work", "sort", "replay") and s.capture is not None and not s.captures(a.on)
-
-
-@rule
-def anything_after_a_failure(a: Act, s: State) -> bool:
-    """Operation failed due to a previous error during capture. So does the end, which ends the capture all the same."""
-    return s.capture is not None and s.capture.invalid and a.what not in ("end", "warp end")
-
-
-@rule
-def reading_memory_that_was_freed(a: Act, _: State) -> bool:
-    """The graph reads memory that has been freed since it was captured (torch's check_input_liveness)."""
-    return a.what == "replay" and a.freed
+IN_A_CAPTURE: Final = "Operation not permitted when stream is capturing"
+RULES: Final = {
+    # The first fault that a GPU showed.
+    "pool_before_the_end": Rule(
+        "pool", lambda a, s: not a.graph.captured, "Called CUDAGraph::pool() without a preceding successful capture (torch).",
+        check=True,
+    ),
+    "replay_before_the_end": Rule(
+        "replay", lambda a, s: not a.graph.captured,
+        "Called CUDAGraph::replay without a preceding successful capture (torch).", check=True,
+    ),
+    "begin_on_the_default_stream": Rule(
+        "begin", lambda a, s: a.on is s.legacy, "CUDA graphs must be captured on a non-default stream (torch).", check=True
+    ),
+    "begin_of_a_graph_that_is_captured": Rule(
+        "begin", lambda a, s: a.graph.captured, "This CUDAGraph instance already owns a captured graph (torch).", check=True
+    ),
+    "second_begin": Rule("begin", capturing, "Operation not permitted: a capture is under way already."),
+    "end_without_begin": Rule(
+        "end", lambda a, s: not (s.capture is a.graph and s.captures(a.on)),
+        "Operation failed: this graph is not being captured, or not on this stream (torch, CUDA).",
+    ),
+    # The second fault that a GPU showed.
+    "a_stream_before_warp_begins": Rule(
+        "warp stream", lambda a, s: not s.warp_runs,
+        "'NoneType' object has no attribute 'cuda_devices' (Warp's stream_from_torch, before `warp.init`).", check=True,
+    ),
+    "warp_joins_what_is_captured": Rule(
+        "warp begin", lambda a, s: not s.captures(a.on),
+        "External capture reported, but the stream is not capturing (Warp's capture_begin).",
+    ),
+    "warp_ends_what_it_began": Rule(
+        "warp end", lambda a, s: not s.warp_knows, "Graph capture is not active on this stream (Warp's capture_end)."
+    ),
+    "sort_that_warp_does_not_know_of": Rule(
+        "sort", lambda a, s: s.capture is not None and not s.warp_knows,
+        "Allocating a temporary sort buffer during unregistered graph capture (Warp; a warning, and the memory leaks).",
+    ),
+    "waiting_for_the_device": Rule(
+        "read", capturing, f"{IN_A_CAPTURE}: the host waits, to read numbers or to know how many there are."
+    ),
+    "pinning_memory": Rule(
+        "pin", capturing, f"{IN_A_CAPTURE}: cudaHostAlloc, in the modes global and thread_local, and the query of an event that "
+        "precedes it (of a torch whose pinned memory has no pools of graphs).",
+    ),
+    # Torch records an event where pinned memory is freed, on each stream that has copied it, and asks for it whenever it pins
+    # memory later (CachingHostAllocatorImpl::free).
+    "freeing_pinned_memory": Rule(
+        "unpin", lambda a, s: s.captures(a.on), "Operation not permitted on an event last recorded in a capturing stream."
+    ),
+    # Of reads outside of a capture it is not known here which are of the device.
+    "sending_where_waits_are_refused": Rule(
+        "send", lambda a, s: s.no_waits, "Called a synchronizing CUDA operation: a copy from memory that is not pinned, as of "
+        '`new_tensor` (torch, after `set_sync_debug_mode("error")`).', check=True,
+    ),
+    "sending_numbers_of_python": Rule(
+        "send", capturing, f"{IN_A_CAPTURE}: a copy from memory that is not pinned, as of torch.tensor."
+    ),
+    "allocating_outside_the_pool": Rule(
+        "allocate", lambda a, s: s.capture is not None and (a.by_warp or not s.captures(a.on)),
+        f"{IN_A_CAPTURE}: cudaMalloc, by Warp or by torch on a stream that is not captured.",
+    ),
+    "allocating_beside_what_is_cached": Rule(
+        "allocate", lambda a, s: s.capture is not None and s.living + s.cached > ROOM,
+        "CUDA out of memory: torch gives cached memory back only where no capture is underway (alloc_block in its allocator).",
+        check=True,
+    ),
+    # CUDAGraph::capture_end, whose endAllocateToPool comes after the check of cudaStreamEndCapture.
+    "emptying_the_cache_in_a_capture": Rule(
+        "empty", lambda a, s: bool(s.underway),
+        "captures_underway.empty() INTERNAL ASSERT FAILED (torch, also after a capture that CUDA has ended by an error).",
+        check=True,
+    ),
+    # Torch 2.13 has a state of the generator for each capture.
+    "random_numbers_after_a_failed_capture": Rule(
+        "random", lambda a, s: s.capture is None and s.seeds, "Offset increment outside graph capture encountered unexpectedly "
+        "(torch: a capture that CUDA has ended by an error leaves the generator as within it).", check=True,
+    ),
+    "timing_in_a_capture": Rule(
+        "event", lambda a, s: s.captures(a.on),
+        "Operation not permitted on an event last recorded in a capturing stream: it has no time, and cannot be asked for one.",
+    ),
+    "destroying_a_graph": Rule(
+        "destroy", capturing, f"{IN_A_CAPTURE}: cudaGraphExecDestroy, where torch does not relax the mode for it."
+    ),
+    "a_graph_of_autograd_on_another_stream": Rule(
+        "graph", lambda a, s: bool(a.on.records), "The AccumulateGrad node's stream does not match the stream of the node that "
+        "produced the incoming gradient (torch from 2.10 on; a warning, and each backward pass waits).", check=True,
+    ),
+    "loading_a_module": Rule(
+        "load", capturing, f"{IN_A_CAPTURE}: cuModuleLoadData, by drivers before CUDA 12.3 (Warp's capture_begin)."
+    ),
+    "waiting_for_a_capturing_stream": Rule(
+        "wait", lambda a, s: s.captures(a.other),
+        "Operation would make the legacy stream depend on a capturing blocking stream.",
+    ),
+    "a_capturing_stream_waiting": Rule(
+        "wait", lambda a, s: s.captures(a.on), "Dependency created on uncaptured work in another stream."
+    ),
+    "work_on_another_stream": Rule(
+        "", lambda a, s: a.what in ("work", "sort", "replay") and s.capture is not None and not s.captures(a.on),
+        "Operation on a stream that is not captured: refused on the default stream, and missing from the graph on others.",
+    ),
+    "anything_after_a_failure": Rule(
+        "", lambda a, s: s.capture is not None and s.capture.invalid and a.what not in ("end", "warp end"),
+        "Operation failed due to a previous error during capture. So does the end, which ends the capture all the same.",
+    ),
+    "reading_memory_that_was_freed": Rule(
+        "replay", lambda a, s: a.freed,
+        "The graph reads memory that has been freed since it was captured (torch's check_input_liveness).",
+    ),
+}  # fmt: skip

@@ -21,7 +21,7 @@ from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_mod
 from torch.utils._pytree import tree_leaves, tree_map
 
 from rasterizers.interface import BackendUnavailable
-from tests.helpers.cuda_rules import CHECKS, ROOM, RULES, Act, State
+from tests.helpers.cuda_rules import ROOM, RULES, Act, State
 
 
 class Pool(dict[int, torch.Tensor]):
@@ -72,11 +72,11 @@ class StrictCuda:
     def ask(self, what: str, on: Stream | None = None, **more: Any) -> None:
         """Refuse the act where a rule does."""
         act, capture = Act(what, on or self.current, **more), self.state.capture
-        for refuses in RULES:
-            if refuses(act, self.state):
-                if capture is not None and refuses not in CHECKS:
+        for rule in RULES.values():
+            if rule.of in ("", what) and rule.refuses(act, self.state):
+                if capture is not None and not rule.check:
                     capture.invalid = True
-                raise RuntimeError(refuses.__doc__)
+                raise RuntimeError(rule.message)
 
     def do(self, call: Callable[..., Any], *arguments: Any) -> None:
         """Call, or note the call of what is captured."""
