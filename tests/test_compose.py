@@ -68,17 +68,14 @@ def test_names_and_overrides_are_those_of_the_command_line_and_milestones_stretc
         (("best,svs",), "svs twice"),
         (("gco", "fit.iterations=3"), r"fit\.iterations: .* A conductor has settings of .*objective"),
         (("gco", "+strategies.p2g.floor=0"), r"strategies.p2g: has settings .*\+strategy=p2g"),
-        (
-            ("gco", "strategies.gco.tolerance"),
-            r"^strategies\.gco\.tolerance: is no setting\. A setting is written name=value",
-        ),
+        (("gco", "strategies.gco.tolerance"), r"^strategies\.gco\.tolerance: is no setting\. A setting is written name=value"),
         (("gco", r"C:\my photos"), r"^C:\\my photos: is no setting\. A setting is written name=value"),
         (("gco", "~strategies.[gco]"), r"^~strategies\.\[gco\]: is no setting\."),
         (("gco", 'strategies.gco.drop="x'), r'^strategies\.gco\.drop: its value "x cannot be read\. Quotation marks'),
         (("gco", "=3"), r"^=3: names no setting\. A setting is written name=value"),
         (("gco", "+readings=paper"), r"\+readings=paper: .*: readings=paper\."),
     ],
-)
+)  # fmt: skip
 def test_what_does_not_exist_is_named(said, named):
     with pytest.raises(SettingError, match=named):
         conductor(*said)

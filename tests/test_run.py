@@ -220,17 +220,11 @@ ENDINGS = {
     RuntimeError('Could not detect "srun", are you indeed'): (2, "hydra/launcher: there is no Slurm on this machine"),
     OSError(errno.ENOSPC, "No space", "x"): (3, "x: No space. Free space, or write elsewhere (hydra.run.dir=FOLDER"),
     OSError(errno.EROFS, "Read-only", "x"): (3, "x: Read-only. Write elsewhere (hydra.run.dir=FOLDER of a run, hydra."),
-    PermissionError(errno.EACCES, "Not permitted", "x"): (
-        3,
-        "x: Not permitted. Allow access to it, or write elsewhere (",
-    ),
-    MemoryError(): (
-        2,
-        "out of memory: Python had none left. Raise `ulimit -v` where it is set. Lower density.max_gaus",
-    ),
+    PermissionError(errno.EACCES, "Not permitted", "x"): (3, "x: Not permitted. Allow access to it, or write elsewhere ("),
+    MemoryError(): (2, "out of memory: Python had none left. Raise `ulimit -v` where it is set. Lower density.max_gaus"),
     ImportError(NOT_MAPPED): (2, f"{NOT_MAPPED}: memory is limited to too little (raise `ulimit -v`), or"),
     OSError("Broken pipe\n\nCOMMAND:\nffmpeg"): (3, "output: Broken pipe COMMAND: ffmpeg. Write elsewhere"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("error", "ending"), ENDINGS.items(), ids=repr)

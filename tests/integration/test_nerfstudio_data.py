@@ -16,13 +16,7 @@ from clear_strategies.data.priors import Bicubic, Cached, Images
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.geometry import stereo
 from clear_strategies.geometry.projection import intrinsics
-from integration.nerfstudio.data import (
-    over_black,
-    photos_of,
-    prior,
-    seed_with_stereo,
-    views_from_datamanager,
-)
+from integration.nerfstudio.data import over_black, photos_of, prior, seed_with_stereo, views_from_datamanager
 from integration.views import save_photos
 from tests.helpers import gsplat_host, toy
 from tests.helpers.gsplat_host import Host

@@ -218,16 +218,12 @@ def test_before_gsplat_1_5_a_gaussian_has_one_radius(packed):
 @pytest.mark.parametrize(
     ("file", "text", "returns_indices"),
     [
-        (
-            "submodules/simple-knn/spatial.h",
-            "std::tuple<torch::Tensor, torch::Tensor> distCUDA2(const torch::Tensor&);",
-            True,
-        ),
+        ("submodules/simple-knn/spatial.h", "std::tuple<torch::Tensor, torch::Tensor> distCUDA2(const torch::Tensor&);", True),
         ("submodules/simple-knn/spatial.h", "torch::Tensor distCUDA2(const torch::Tensor& points);", False),
         ("scene/gaussian_model.py", "dist, nearest_indices = distCUDA2(self.get_xyz)", True),
         ("scene/gaussian_model.py", "dist2 = torch.clamp_min(distCUDA2(points), 0.0000001)", False),
     ],
-)
+)  # fmt: skip
 def test_distances_come_with_indices_where_a_fork_has_them_also_without_its_submodules(
     file, text, returns_indices, tmp_path
 ):

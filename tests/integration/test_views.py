@@ -85,14 +85,11 @@ MISFITS = {
     "NaN": ({"image": PHOTO.image / 0}, r"image: has 1,152 numbers that are not finite"),
     "half a factor": ({"factor": 2.5}, "factor: must be a whole number of at least 1, got 2.5"),
     "a folder as sr": ({"sr": "sr_x4"}, "sr: must be a function or a prior, got 'sr_x4': of a folder"),
-    "channels first": (
-        {"image": PHOTO.image.permute(2, 0, 1)},
-        r"image: must have shape \[h, w, 3\], got \(3, 16, 24\)",
-    ),
+    "channels first": ({"image": PHOTO.image.permute(2, 0, 1)}, r"image: must have shape \[h, w, 3\], got \(3, 16, 24\)"),
     "a 4x4 K": ({"K": torch.eye(4)}, r"K: must have shape \[3, 3\], got \(4, 4\)"),
     "a mask of one channel": ({"mask": torch.ones(16, 24, 1)}, r"mask: must have shape \(16, 24\), got \(16, 24, 1\)"),
     "a mask of levels": ({"mask": torch.full((16, 24), 255, dtype=torch.uint8)}, r"mask: must lie in \[0, 1\]"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MISFITS)

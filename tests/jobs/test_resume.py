@@ -247,15 +247,12 @@ def test_a_run_from_python_that_is_refused_leaves_no_folder(tmp_path: Path, monk
     ("wrong", "told"),
     [
         ("fit.resume=gone", "gone: checkpoint: no checkpoint is here: "),
-        (
-            "fit.resume=run density.every=50",
-            "config: this is not the configuration that wrote it: density.every: 100 then, 50",
-        ),
+        ("fit.resume=run density.every=50", "config: this is not the configuration that wrote it: density.every: 100 then, 50"),
         ("data.path=gone/fern", "gone: data.path: is not there: correct the path"),
         ("prior=images prior.path=gone", "gone: prior.path: is not there: correct the path"),
         ("data.cloud.init=ply data.cloud.path=gone.ply", "gone.ply: data.cloud.path: is not there: correct the path"),
     ],
-)
+)  # fmt: skip
 def test_what_is_not_there_and_another_configuration_are_told_before_data_are_read(
     wrong: str, told: str, finished_run: Path, monkeypatch
 ) -> None:

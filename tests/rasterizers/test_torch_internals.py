@@ -82,11 +82,7 @@ def test_a_pass_that_fails_calls_nothing():
 
 @pytest.mark.parametrize(
     ("by", "expected"),
-    [
-        (lambda y, _: y.backward(), True),
-        (lambda y, x: y.backward(inputs=[x]), True),
-        (torch.autograd.grad, False),
-    ],
+    [(lambda y, _: y.backward(), True), (lambda y, x: y.backward(inputs=[x]), True), (torch.autograd.grad, False)],
 )
 def test_a_pass_adds_to_a_leaf_or_returns_its_gradient(by, expected):
     x = Parameter(torch.ones(3))

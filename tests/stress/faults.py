@@ -200,12 +200,9 @@ SCENARIOS = [
     *(_saving("three saves", k, 200, 300, 400) for k in (1, 2)),
     Scenario("first export", _first, _export),
     Scenario("export over another", partial(_first, exported=True), _export),
-    *(
-        Scenario(f"resumed run, keep={k}", partial(_first, keep=k, exported=True), partial(_resume, keep=k))
-        for k in (1, 2, 3)
-    ),
+    *(Scenario(f"resumed run, keep={k}", partial(_first, keep=k, exported=True), partial(_resume, keep=k)) for k in (1, 2, 3)),
     Scenario("resumed after a death", _died, _resume),
-]
+]  # fmt: skip
 
 
 def measure(folder: Path, *, most: int | None = None) -> Row:

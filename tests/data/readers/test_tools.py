@@ -83,16 +83,13 @@ def test_two_files_that_a_name_could_mean_are_not_chosen_from(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("moved", "message"),
     [
-        (
-            "images/cam0",
-            r"images, such as a\.png; it holds 3 others, such as cam0/a\.png: .*data\.reader\.images=(\S+)",
-        ),
+        ("images/cam0", r"images, such as a\.png; it holds 3 others, such as cam0/a\.png: .*data\.reader\.images=(\S+)"),
         (
             "photos",
             r"none of the folders images, .*, but photos holds 3, more/cam2 holds 3: name .*: data\.reader\.images=FOLDER",
         ),
     ],
-)
+)  # fmt: skip
 def test_where_no_photo_is_there_the_message_says_what_is(moved: str, message: str, tmp_path: Path) -> None:
     root = tiny.colmap_txt(tmp_path)
     (root / moved).mkdir()

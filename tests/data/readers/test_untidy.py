@@ -277,11 +277,7 @@ READ: dict[str, tuple[Callable[[Path], object], list[str], str]] = {
     "HEIC among others": (lambda f: as_heic(f, "b.heic"), ["a.png", "b.heic", "c.png"], ""),
     "HEIC that calls itself JPEG": (lambda f: as_heic(f, "b.jpg"), ["a.png", "b.jpg", "c.png"], ""),
     "a photo saved as HEIC and as JPEG": (lambda f: beside(f, "b.HEIC"), ALL, "b.HEIC"),
-    "what a Mac and a phone leave": (
-        lambda f: beside(f, "._a.png", ".DS_Store", "clip.mov", "Thumbs.db"),
-        ALL,
-        "clip.mov",
-    ),
+    "what a Mac and a phone leave": (lambda f: beside(f, "._a.png", ".DS_Store", "clip.mov", "Thumbs.db"), ALL, "clip.mov"),
     "a preview beside the photos": (
         lambda f: image_of(f / "a.png").resize((2, 1)).save(f / "a_thumb.jpg"),
         ALL,
@@ -290,11 +286,7 @@ READ: dict[str, tuple[Callable[[Path], object], list[str], str]] = {
     "links to another folder": (linked, ALL, ""),
     "a link to nowhere": (lambda f: (f / "d.png").symlink_to(f / "gone.png"), ALL, ""),
     "a browser's ending of JPEG": (lambda f: again(f, "b.jfif", format="JPEG"), ["a.png", "b.jfif", "c.png"], ""),
-    "an ending in capitals, a name with spaces": (
-        lambda f: again(f, "b é (1).JPG"),
-        ["a.png", "b é (1).JPG", "c.png"],
-        "",
-    ),
+    "an ending in capitals, a name with spaces": (lambda f: again(f, "b é (1).JPG"), ["a.png", "b é (1).JPG", "c.png"], ""),
     "masks among the photos": (
         lambda f: [Image.new("L", (WIDTH, HEIGHT), 1).save(f / f"{n}.mask.png") for n in NAMES],
         ALL,
@@ -322,7 +314,7 @@ READ: dict[str, tuple[Callable[[Path], object], list[str], str]] = {
         ALL,
         "sparse holds no model (cameras.bin and images.bin, or .txt): the poses are estimated anew",
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", READ)

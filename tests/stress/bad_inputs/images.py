@@ -43,10 +43,7 @@ _PNG, _JPEG, _WEBP, _TIFF = (_encoded(form) for form in ("PNG", "JPEG", "WEBP", 
 _UNREADABLE, _BROKEN = "a.png: file: is no readable image", "a.png: pixels: cannot be decoded"
 _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "absent": (at("none.png", read_image), "none.png: file: is not there"),
-    "a folder": (
-        at("a.png", read_image, Path.mkdir),
-        r"a.png: file: cannot be read \(Is a directory\): check the file",
-    ),
+    "a folder": (at("a.png", read_image, Path.mkdir), r"a.png: file: cannot be read \(Is a directory\): check the file"),
     "a pipe": (at("a.png", read_header, os.mkfifo), "a.png: file: is a pipe, a device or a socket"),
     "a device": (at("a.png", read_image, a_device), "a.png: file: is a pipe, a device or a socket"),
     "empty": (_read(b""), _UNREADABLE),
@@ -75,5 +72,5 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "another size": (_read(_PNG, expect=(30, 40)), "a.png: size: is 40x30 where 30x40 is expected"),
     "larger than allowed": (_read(bomb(30_000, 20_000)), "a.png: size: 30000x20000 is more than 500,000,000 pixels"),
     "header of 3.6 gigapixels": (_read(bomb(60_000, 60_000)), "a.png: (size|file)"),
-}
+}  # fmt: skip
 INPUTS = [BadInput("image", name, give, pattern) for name, (give, pattern) in _CASES.items()]

@@ -63,10 +63,7 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "network in words": (_onnx(b"not a network at all"), "net.onnx: "),
     "network that is a pickle": (_onnx(pickle.dumps(Canary(Path("canary")))), "net.onnx: "),
     "network cut to 500 bytes": (_onnx(_GOOD[:500]), "net.onnx: "),
-    "network for another factor": (
-        _onnx(onnx_bytes(upscaling_weight(scale=2), scale=2)),
-        "where .* is expected: use a x4",
-    ),
+    "network for another factor": (_onnx(onnx_bytes(upscaling_weight(scale=2), scale=2)), "where .* is expected: use a x4"),
     "network that makes NaN": (_onnx(onnx_bytes(upscaling_weight() * math.nan)), "net.onnx: output: is not finite"),
     "network that makes millions": (_onnx(onnx_bytes(upscaling_weight() * 1e9)), "net.onnx: output: "),
     "weights at an absolute path": (_external("{folder}/secret.bin"), "external.onnx: weights: lie in other files"),
@@ -76,10 +73,7 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "SR image without its suffix": (_images(lambda sr: None, suffix="_x4"), "a: has no SR image a_x4"),
     "two SR images of one view": (_images(lambda sr: (sr / "a.jpg").write_bytes(b"twin")), "for one view: keep one"),
     "one SR image of two views": (_two_views_of_one_image, "would be that of two views"),
-    "SR image of the LR size": (
-        _images(lambda sr: write_png(sr / "a.png", photo(*_LR))),
-        "is 12x8 where 48x32 is expected",
-    ),
+    "SR image of the LR size": (_images(lambda sr: write_png(sr / "a.png", photo(*_LR))), "is 12x8 where 48x32 is expected"),
     "SR image turned": (_images(lambda sr: write_png(sr / "a.png", photo(48, 32))), "a.png: size: is 32x48"),
-}
+}  # fmt: skip
 INPUTS = [BadInput("SR model", name, give, pattern) for name, (give, pattern) in _CASES.items()]
