@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -84,6 +84,24 @@ def step(t: int = 1, evidence: Evidence | None = None, visible: Tensor | None = 
     if visible is None and evidence is not None:
         visible = torch.ones(len(evidence.demand), dtype=torch.bool)
     return Step(t, View("toy", photo, photo), visible, evidence)
+
+
+@dataclass(frozen=True)
+class Shows(Strategy):
+    """Shows the field what a function makes of its training views in an iteration."""
+
+    shown: Callable[[Sequence[View], int], Sequence[ExtraView]]
+
+    def on_views(self, views: Sequence[View]) -> None:
+        self.__dict__["views"] = views  # which is nothing that it stores, as a replay asks
+
+    def extra_views(self, t: int) -> Sequence[ExtraView]:
+        return self.shown(self.__dict__["views"], t)
+
+
+def again(photo: Photo, weight: float = 1.0, **settings: Any) -> ExtraView:
+    """A photo as an extra view, with this weight at every pixel."""
+    return ExtraView(photo, torch.full_like(photo.image[..., 0], weight), **settings)
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,12 @@ from clear_strategies.errors import DivergedError
 from clear_strategies.training.loop import EXTRA_LOSS, extra_steps, iterate
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
-from tests.helpers.short_run import ITERATIONS, start
+from tests.helpers.short_run import ITERATIONS, SCENE, start
 
 
-@dataclass(frozen=True)
-class Dark(Strategy):
+def dark(every: int = 2) -> toy.Shows:
     """Shows the field a black picture at every `every`-th iteration."""
-
-    every: int = 2
-
-    def extra_views(self, t):
-        return () if t % self.every else (black(),)
+    return toy.Shows(lambda views, t: () if t % every else (black(),))
 
 
 @dataclass(frozen=True)
@@ -31,8 +26,8 @@ class Red(Strategy):
 
 
 def black(weight: float = 1.0) -> ExtraView:
-    photo = toy.scene(16, seed=2, train=3, test=1).train[0].lr
-    return ExtraView(Photo(photo.camera, torch.zeros_like(photo.image)), torch.full(photo.image.shape[:2], weight))
+    photo = SCENE.train[0].lr
+    return toy.again(Photo(photo.camera, torch.zeros_like(photo.image)), weight)
 
 
 def parameters(state: TrainState) -> dict[str, torch.Tensor]:
@@ -40,7 +35,7 @@ def parameters(state: TrainState) -> dict[str, torch.Tensor]:
 
 
 def test_they_come_when_a_strategy_says_so_and_are_compared_before_the_background():
-    state = start((), more=[Dark()])
+    state = start((), more=[dark()])
     for _ in range(ITERATIONS):
         iterate(state, toy.RASTERIZER)
     rows = state.history_as_floats()
@@ -56,7 +51,7 @@ def test_they_come_when_a_strategy_says_so_and_are_compared_before_the_backgroun
 
 
 def test_every_strategy_is_asked_unless_there_is_no_lr_loss_and_the_weight_scales_the_gradient():
-    conductor = start((), more=[Dark(), Dark(every=3)]).conductor
+    conductor = start((), more=[dark(), dark(every=3)]).conductor
     assert len(conductor.extra_views(6)) == 2
     object.__setattr__(conductor.objective, "lambda_lr", 0.0)
     assert conductor.extra_views(6) == []

@@ -1,7 +1,7 @@
 """Replayed iterations: the bits of the live ones, and every reason to be live."""
 
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
@@ -13,7 +13,7 @@ import torch
 import clear_strategies as cs
 import rasterizers
 from clear_strategies.core import work_log
-from clear_strategies.core.view import ExtraView, Photo, View
+from clear_strategies.core.view import Photo, View
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.density.mcmc import MCMC
@@ -30,6 +30,7 @@ from clear_strategies.training.state import TrainState
 from rasterizers import replays
 from rasterizers.recording import Recording, running
 from rasterizers.replays import ReplayKey, Replays, shapes_of
+from tests.helpers import toy
 from tests.helpers.backends import needs
 from tests.helpers.short_run import SCENE, tensors, with_depth
 from tests.training.test_resume import without_time
@@ -50,16 +51,9 @@ DEVICE = torch.device("cpu")
 
 
 def start(
-    *more: cs.Strategy,
-    iterations: int = 250,
-    density: bool = True,
-    scene: Scene = SCENE,
-    rises_at: int | None = None,
-    degree_every: int = 75,
-    scores_from: int = 1,
-    reconciles: cs.Strategy | None = None,
-    **of_svs: Any,
-) -> TrainState:
+    *more: cs.Strategy, iterations: int = 250, density: bool = True, scene: Scene = SCENE, rises_at: int | None = None,
+    degree_every: int = 75, scores_from: int = 1, reconciles: cs.Strategy | None = None, **of_svs: Any,
+) -> TrainState:  # fmt: skip
     """A training of everything that `best` is made of, over which λ_HR rises and falls, and with an anchor."""
     from clear_strategies.kernels.gaussian_step.warp import WarpGaussianStep
 
@@ -168,18 +162,6 @@ def masked(view: View, rows: int) -> View:
 
 
 @dataclass(frozen=True)
-class SometimesRobust(cs.Strategy):
-    """Shows the field the photo of another view, as one that was invented in part at every third iteration."""
-
-    def on_views(self, views: Sequence[View]) -> None:
-        self.__dict__["photo"] = views[0].lr
-
-    def extra_views(self, t: int) -> Sequence[ExtraView]:
-        photo = self.__dict__["photo"]
-        return [ExtraView(photo, torch.ones_like(photo.image[..., 0]), robust=t % 3 == 0)]
-
-
-@dataclass(frozen=True)
 class Late(Ramp):
     """Dropout that begins at t=6."""
 
@@ -187,14 +169,13 @@ class Late(Ramp):
         return 0.2 if t >= 6 else 0.0
 
 
+OF_TWO_SIZES = replace(SCENE, train=tuple(cropped(v, 2 * (k == 1)) for k, v in enumerate(SCENE.train)))
 KINDS = {
     "masks": lambda: start(
         density=False, scene=replace(SCENE, train=tuple(masked(v, 3 * k) for k, v in enumerate(SCENE.train)))
     ),
-    "size of the photos": lambda: start(
-        density=False, scene=replace(SCENE, train=tuple(cropped(v, 2 * (k == 1)) for k, v in enumerate(SCENE.train)))
-    ),
-    "robust": lambda: start(SometimesRobust(), density=False),
+    "size of the photos": lambda: start(density=False, scene=OF_TWO_SIZES),
+    "robust": lambda: start(toy.Shows(lambda views, t: [toy.again(views[0].lr, robust=t % 3 == 0)]), density=False),
     "degree": lambda: start(density=False, degree_every=5),
     "background": lambda: start(cs.RandomBackground(until=1_350), cs.FadingOpacity(rate=0.002), density=False),
     "dropout": lambda: start(density=False, dropout=Late()),
@@ -211,29 +192,22 @@ def test_what_differs_between_iterations_is_copied_or_makes_them_of_two_kinds(di
 
 
 @dataclass(frozen=True)
-class PullsLate(cs.Strategy):
-    """Moves all bands from t=8 on, with nothing stored that tells."""
+class Pulls(cs.Strategy):
+    """Moves all bands in iterations from `first` to `last`, with nothing stored that tells."""
+
+    first: int
+    last: int
 
     def regularize(self, params, t):
-        return cs.Grads({"shN": 1e-3 * (1 + params["shN"])}) if t >= 8 else None
+        return cs.Grads({"shN": 1e-3 * (1 + params["shN"])}) if self.first <= t <= self.last else None
 
 
-def test_a_recorded_step_on_an_extra_view_steps_every_band_that_has_momentum_by_then():
-    replayed = both(lambda: start(PullsLate(), cs.PseudoViews(count=8, reach=0.1), density=False), 14)
-    assert live_in(replayed).keys() == {FIRST}
-
-
-@dataclass(frozen=True)
-class PullsOnce(cs.Strategy):
-    """Moves all bands in one iteration."""
-
-    def regularize(self, params, t):
-        return cs.Grads({"shN": 1e-3 * (1 + params["shN"])}) if t == 9 else None
-
-
-def test_a_recorded_step_on_a_photo_of_another_size_does_so_too():
-    sizes = replace(SCENE, train=tuple(cropped(v, 2 * (k == 1)) for k, v in enumerate(SCENE.train)))
-    replayed = both(lambda: start(PullsOnce(), density=False, scene=sizes), 18)
+@pytest.mark.parametrize("on", ["an extra view", "a photo of another size"])
+def test_a_recorded_step_moves_every_band_that_has_momentum_by_then(on):
+    if on == "an extra view":
+        replayed = both(lambda: start(Pulls(8, 99), cs.PseudoViews(count=8, reach=0.1), density=False), 14)
+    else:
+        replayed = both(lambda: start(Pulls(9, 9), density=False, scene=OF_TWO_SIZES), 18)
     assert replays_of(replayed) >= 7
     assert live_in(replayed).keys() == {FIRST}
 
