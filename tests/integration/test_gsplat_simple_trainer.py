@@ -42,6 +42,18 @@ def launched(monkeypatch, tmp_path, caplog):
     return run
 
 
+@pytest.fixture
+def trainer(launched, monkeypatch, tmp_path):
+    """The stand-in as a module, with CLEAR in its Runner."""
+    from integration.gsplat import install
+    from tests.helpers import simple_trainer
+
+    monkeypatch.setattr(simple_trainer, "rasterization", gsplat.rendering.rasterization)
+    monkeypatch.setattr(simple_trainer, "Runner", type("Runner", (simple_trainer.Runner,), {}))
+    install(simple_trainer.Runner, sr=tmp_path / "sr", overrides=FROM_START)
+    return simple_trainer
+
+
 def test_its_checkpoint_and_its_ply_are_the_model_that_was_evaluated(launched, tmp_path, caplog):
     assert launched("--pose_noise", "0.01") == 0
     assert "8 merges" in caplog.text  # views are recognised by their index
@@ -64,16 +76,11 @@ def test_a_strategy_that_densifies_has_no_effect_and_says_so(launched, caplog):
 
 @pytest.mark.parametrize(("reset_every", "largest", "is_told"), [(3, 0.01, True), (3, 10.0, False), (9, 0.01, False)])
 def test_pruning_by_size_that_would_remove_many_of_the_first_gaussians_is_told(
-    launched, tmp_path, caplog, reset_every, largest, is_told
+    trainer, tmp_path, caplog, reset_every, largest, is_told
 ):
-    from integration.gsplat import install
-    from tests.helpers import simple_trainer
-
-    runner_class = type("Runner", (simple_trainer.Runner,), {})
-    install(runner_class, sr=tmp_path / "sr", overrides=FROM_START)
-    cfg = simple_trainer.Config(str(tmp_path))
+    cfg = trainer.Config(str(tmp_path))
     cfg.strategy = replace(cfg.strategy, reset_every=reset_every, prune_scale3d=largest)
-    runner = runner_class(0, 0, 1, cfg)
+    runner = trainer.Runner(0, 0, 1, cfg)
     runner.trainset = None  # so that it does not train
     with pytest.raises(TypeError):
         runner.train()
@@ -87,13 +94,8 @@ def test_options_that_do_not_work_with_two_scales_are_refused_before_the_first_s
     assert not (tmp_path / "ckpt.pt").exists()
 
 
-def test_splats_without_harmonics_are_refused_before_their_photos_are_enlarged(launched, tmp_path):
-    from integration.gsplat import install
-    from tests.helpers import simple_trainer
-
-    runner_class = type("Runner", (simple_trainer.Runner,), {})
-    install(runner_class, sr=tmp_path / "sr", overrides=FROM_START)
-    runner = runner_class(0, 0, 1, simple_trainer.Config(str(tmp_path)))
+def test_splats_without_harmonics_are_refused_before_their_photos_are_enlarged(trainer, tmp_path):
+    runner = trainer.Runner(0, 0, 1, trainer.Config(str(tmp_path)))
     runner.splats, runner.trainset = {"features": runner.splats["sh0"]}, None
     with pytest.raises(HostError, match="harmonic textures"):
         runner.train()
@@ -146,17 +148,11 @@ def test_a_process_for_each_gpu_which_would_train_without_clear_is_refused(launc
     assert not (tmp_path / "ckpt.pt").exists()
 
 
-def test_a_second_runner_in_one_process_trains_too(launched, tmp_path, monkeypatch):
-    from integration.gsplat import install
-    from tests.helpers import simple_trainer
-
-    runner_class = type("Runner", (simple_trainer.Runner,), {})
-    monkeypatch.setattr(simple_trainer, "rasterization", gsplat.rendering.rasterization)
-    install(runner_class, sr=tmp_path / "sr", overrides=FROM_START)
+def test_a_second_runner_in_one_process_trains_too(trainer, tmp_path):
     drawn, shown = [], []
     for name in ("first", "second"):
         (tmp_path / name).mkdir()
-        runner = runner_class(0, 0, 1, simple_trainer.Config(str(tmp_path / name)))
+        runner = trainer.Runner(0, 0, 1, trainer.Config(str(tmp_path / name)))
         runner.train()
         drawn.append(torch.load(tmp_path / name / "image.pt"))
         assert runner.clear.attachment.counts["merges"] == 8
