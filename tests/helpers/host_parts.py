@@ -1,5 +1,6 @@
 """What the stand-ins for other trainers share."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
@@ -7,10 +8,13 @@ from torch import Tensor
 
 from clear_strategies import Objective
 from clear_strategies.core import images
+from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.kernels import losses
 from clear_strategies.schedules import WarmupDecay
+from integration import AutogradShot
+from rasterizers import Camera, Splats, autograd
 from tests.helpers import toy
 
 FROM_START = ["objective.lambda_hr.start=0", "objective.lambda_hr.full=0", "strategies.p2g.patch=4"]
@@ -32,6 +36,19 @@ def as_item(photo, i):
     """A photo as the datasets of gsplat's examples give it."""
     pose = torch.linalg.inv(photo.camera.world_to_camera)
     return {"K": intrinsics(photo.camera).float(), "camtoworld": pose, "image": photo.image * 255, "image_id": i}
+
+
+def shot_of(
+    params: Mapping[str, Tensor], camera: Camera, offset: Tensor | None = None, centres: Tensor | None = None, **computed: Tensor
+) -> AutogradShot:  # fmt: skip
+    """A rendering of raw parameters by torch's autograd.
+
+    Args:
+        offset: of the colours. centres: see `autograd.draw`. computed: what takes the place of activated parameters.
+    """
+    drawn = {**params, "scales": params["scales"].exp(), "opacities": params["opacities"].sigmoid(), **computed}
+    found = autograd.draw(toy.RASTERIZER, Splats(*map(drawn.get, PARAMETERS), offset), camera, centres)
+    return AutogradShot(found.image, found.means2d, found.visible, params)
 
 
 class InNdc(torch.autograd.Function):

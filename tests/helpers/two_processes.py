@@ -10,10 +10,9 @@ from torch.nn.parallel import DistributedDataParallel
 from clear_strategies import GCO, P2G, SVS, Conductor
 from clear_strategies.errors import SettingError
 from clear_strategies.schedules import Ramp
-from integration import AutogradShot, joint_loss
-from rasterizers import Splats, autograd
+from integration import joint_loss
 from tests.helpers import gsplat_host, toy
-from tests.helpers.host_parts import HR_FROM_START
+from tests.helpers.host_parts import HR_FROM_START, shot_of
 
 STEPS = 4
 
@@ -29,11 +28,9 @@ class Model(torch.nn.Module):
         return joint_loss(conductor, self.rows, *self._both(view, conductor.gate(t, 20)), view, t)
 
     def _both(self, view, gate):
-        for camera, offset in ((view.lr.camera, None), (view.hr.camera, self.rows["detail"])):
-            p = {name: x for name, x in self.rows.items() if name != "detail" or offset is not None}
-            activated = p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid() * gate, p["sh0"], p["shN"]
-            drawn = autograd.draw(toy.RASTERIZER, Splats(*activated, offset), camera)
-            yield AutogradShot(drawn.image, drawn.means2d, drawn.visible, p)
+        gated, without = self.rows["opacities"].sigmoid() * gate, {k: x for k, x in self.rows.items() if k != "detail"}
+        yield shot_of(without, view.lr.camera, opacities=gated)
+        yield shot_of(self.rows, view.hr.camera, self.rows["detail"], opacities=gated)
 
 
 def train(rank: int, file: str) -> None:

@@ -8,14 +8,13 @@ import pytest
 import torch
 
 from clear_strategies import GCO, P2G, SVS, Conductor, Strategy
-from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.core.step import Step
 from clear_strategies.training.field import GaussianField
 from integration import AutogradShot, HostError, ScoreScaler, extra_loss, graph, joint_loss
 from integration.autograd_shot import ScreenGradientSlot
-from rasterizers import Splats, autograd
+from rasterizers import autograd
 from tests.helpers import toy, two_processes
-from tests.helpers.host_parts import HR_FROM_START
+from tests.helpers.host_parts import HR_FROM_START, shot_of
 
 
 class Host:
@@ -36,9 +35,7 @@ class Host:
 
     def draw(self, camera, offset=None, centres=None, **computed):
         """A shot with this offset of the colours."""
-        drawn = self.activated(**computed)
-        shot = autograd.draw(toy.RASTERIZER, Splats(*map(drawn.get, PARAMETERS), offset), camera, centres)
-        return AutogradShot(shot.image, shot.means2d, shot.visible, self.params)
+        return shot_of(self.params, camera, offset, centres, **computed)
 
     def render(self, camera, z=None, detail=True):
         p = self.params
@@ -397,6 +394,9 @@ def test_what_is_no_rendering_of_the_parameters_is_refused():
         joint(host.params, lr, frozen)
     with pytest.raises(ValueError, match=r"must have the shape \[16, 24, 3\] of its LR image, got \[16, 24, 4\]"):
         joint(host.params, replace(lr, image=torch.cat((lr.image, lr.image[..., :1]), -1)), hr)
+    rule = r"view view0: the HR rendering must have the shape \[64, 96, 3\] .*, got \[16, 24, 3\]"
+    with pytest.raises(ValueError, match=rule):
+        joint(host.params, lr, host.render(view.lr.camera))
 
 
 @pytest.mark.parametrize("scale", ["lr", "hr"])
@@ -439,14 +439,6 @@ def test_a_parameter_of_another_name_is_summed():
     lr, hr = host.draw(view.lr.camera, tint + 0), host.draw(view.hr.camera, tint + host.params["detail"])
     joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
     torch.testing.assert_close(tint.grad, *gradients(conductor.objective, lr, hr, view, tint))
-
-
-def test_a_rendering_of_another_size_is_refused():
-    host, conductor, view, small, _ = drawn()
-    with pytest.raises(
-        ValueError, match=r"view view0: the HR rendering must have the shape \[64, 96, 3\] .*, got \[16, 24, 3\]"
-    ):
-        joint_loss(conductor, host.params, small, host.render(view.lr.camera), view, 5)
 
 
 @pytest.mark.parametrize("drawn", ["lr", "hr", "a pose of no view"])

@@ -7,14 +7,12 @@ import torch
 
 from clear_strategies import SVS, Conductor
 from clear_strategies.errors import SettingError
-from integration import AutogradShot, HostError
+from integration import HostError
 from integration.attachment import Attachment
 from integration.autograd_shot import HostOutput
 from integration.host import Host
-from rasterizers import Splats
-from rasterizers.autograd import draw
 from tests.helpers import gsplat_host, toy
-from tests.helpers.host_parts import HR_FROM_START
+from tests.helpers.host_parts import HR_FROM_START, shot_of
 
 
 class Adapter:
@@ -28,9 +26,8 @@ class Adapter:
 
     def render_at(self, target, gate, view):
         p, camera = self.splats, view.lr.camera if target == "lr" else view.hr.camera
-        activated = p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"]
-        drawn = draw(toy.RASTERIZER, Splats(*activated, p.get("detail") if target == "hr" else None), camera)
-        return HostOutput(AutogradShot(drawn.image, drawn.means2d, drawn.visible, p), drawn.image, [drawn.image])
+        shot = shot_of(p, camera, p.get("detail") if target == "hr" else None)
+        return HostOutput(shot, shot.image, [shot.image])
 
     def step(self, change=lambda output: output):
         def render_at(*asked):

@@ -38,10 +38,10 @@ from clear_strategies.testing import CHECKS, ContractError, check_strategy, give
 from clear_strategies.training import loop
 from clear_strategies.training.densifier import Densifier
 from clear_strategies.training.field import GaussianField
-from integration import AutogradShot
 from rasterizers import Splats, autograd
 from tests.helpers import short_run, toy
 from tests.helpers.compiled_step_cases import ALWAYS
+from tests.helpers.host_parts import shot_of
 
 
 @dataclass(frozen=True)
@@ -77,13 +77,13 @@ def answering(hook, answer, **facts):
     return dataclass(frozen=True)(type("Mine", (Strategy,), {hook: answered, **facts}))
 
 
-@dataclass(frozen=True)
-class Careless(Strategy):
-    """Changes what it was only shown."""
+def distrusts(products, step):
+    """Changes the evidence of another strategy."""
+    return Weights() if step.evidence is None else Weights(keep=step.evidence.reliability.mul_(0.5))
 
-    def correct(self, lr, hr, step):
-        hr["means"] *= 2
-        return hr
+
+def NO_GATE(self, t, n):
+    """A hook of a strategy that has to have one beside `on_views`."""
 
 
 @dataclass(frozen=True)
@@ -93,16 +93,6 @@ class Secretive(Strategy):
     def score(self, step, screens):
         self.cache["calls"] = self.cache.get("calls", 0) + 1
         return screens.ordinary * self.cache["calls"]
-
-
-@dataclass(frozen=True)
-class Distrusts(Strategy):
-    """Changes the evidence of another strategy."""
-
-    def reconcile(self, products, step):
-        if step.evidence is not None:
-            step.evidence.reliability.mul_(0.5)
-        return Weights()
 
 
 @dataclass(frozen=True)
@@ -125,25 +115,6 @@ class Resizes(Strategy):
 
 
 @dataclass(frozen=True)
-class NeedsViews(Strategy):
-    """Reads views that another trainer loads later."""
-
-    def on_views(self, views):
-        self.cache["width"] = views[0].lr.camera.width
-
-    def gate(self, t, n):
-        return None
-
-
-@dataclass(frozen=True)
-class Untold(Strategy):
-    """Has a summary of what is not prepared."""
-
-    def summary(self):
-        return self.cache["prepared"]
-
-
-@dataclass(frozen=True)
 class OfTensors(Strategy):
     weights: torch.Tensor = field(default_factory=lambda: torch.ones(6))
 
@@ -156,12 +127,13 @@ class OfFunctions(Strategy):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (Careless, "changed in place"),
+        (answering("correct", lambda lr, hr, step: hr | {"means": hr["means"].mul_(2)}), "a gradient was changed in place"),
+        (answering("reconcile", distrusts), "the evidence was changed in place"),
         (answering("gate", lambda t, n: (torch.rand(n) > 0.5).float()), "derive randomness"), (Secretive, "does not continue"),
-        (Distrusts, "the evidence was changed in place"),
         (answering("after_step", lambda p, step: step.visible.float()), "after_step fails in an iteration without HR"),
-        (NeedsViews, "on_views fails where there are no views yet"), (Fixed, r"Fixed.reconcile\(\) must give .* \[37\]"),
-        (Resizes, "on_resize fails from 30 Gaussians to 30"), (Untold, "summary fails"),
+        (answering("on_views", lambda views: views[0].lr, gate=NO_GATE), "on_views fails where there are no views yet"),
+        (Fixed, r"Fixed.reconcile\(\) must give .* \[37\]"),
+        (Resizes, "on_resize fails from 30 Gaussians to 30"), (answering("summary", lambda: {}["prepared"]), "summary fails"),
         (OfTensors, "settings cannot be compared"), (OfFunctions, "cannot be sent to another process"),
     ],
 )  # fmt: skip
@@ -177,7 +149,7 @@ CHANGES = {
     "visible": ("observe", lambda step, hr: step.visible.logical_not_(), "a rendering's means2d or visible"),
     "the statistic": ("score", lambda step, screen: screen.ordinary.mul_(2), "screen.ordinary"),
     "opacities": ("regularize", lambda params, t: params["opacities"].clamp_(max=4), "a parameter"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("what", CHANGES)
@@ -188,7 +160,7 @@ def test_the_contract_finds_what_a_hook_changes_in_place(what):
         change(*arguments)  # whose answer is none of the hook's
 
     with pytest.raises(ContractError, match=f"^{named} was changed in place by a hook"):
-        check_strategy(answering(hook, changing, **({} if hook != "on_views" else {"gate": lambda self, t, n: None})))
+        check_strategy(answering(hook, changing, **({} if hook != "on_views" else {"gate": NO_GATE})))
 
 
 def test_the_contract_finds_a_parameter_of_other_memory_and_names_a_number_that_is_not_finite():
@@ -412,12 +384,7 @@ def test_hooks_run_without_autograd_so_that_state_keeps_no_graph():
     s = type("Asked", (Strategy,), {name: hook(name) for name in answers})()
     field, view = field_and_view(torch.float32)
     leaves = {name: p.requires_grad_() for name, p in field.raw().items()}
-    splats = Splats(*(leaves[name] for name in ("means", "quats")), leaves["scales"].exp(), leaves["opacities"].sigmoid(),
-                    leaves["sh0"], leaves["shN"])  # fmt: skip
-    shots = []
-    for photo in (view.lr, view.hr):
-        drawn = autograd.draw(toy.RASTERIZER, splats, photo.camera)
-        shots.append(AutogradShot(drawn.image, drawn.means2d, drawn.visible, leaves))
+    shots = [shot_of(leaves, photo.camera) for photo in (view.lr, view.hr)]
     conductor = Conductor(s, objective=Objective(lambda_hr=ALWAYS))
     conductor.on_fit_start(1, 0, views=[view])
     conductor.gate(1, len(field))
@@ -508,11 +475,7 @@ def test_a_number_of_the_run_is_state_as_rows_are():
 @pytest.mark.parametrize(
     ("where", "stored", "message"),
     [
-        (
-            "state",
-            lambda p: {"x": torch.zeros(5)},
-            "'x'.* a tensor with a row for each Gaussian, 30, or without .*, got .* .5.",
-        ),
+        ("state", lambda p: {"x": torch.zeros(5)}, "'x'.* a tensor with a row for each Gaussian, 30, or without .*, got .* .5."),
         ("state", lambda p: {"x": 0.5}, "'x'.* a tensor with a row for each Gaussian, 30, or without .*, got 0.5"),
         ("state", lambda p: {"x": p}, "'x'.* a tensor of its own, got the memory of a parameter"),
         ("state", lambda p: {"x": p[:, 2]}, "'x'.* a tensor of its own, got the memory of a parameter"),
@@ -522,7 +485,7 @@ def test_a_number_of_the_run_is_state_as_rows_are():
         ("run_state", lambda p: {"x": 0.5}, "'x'.* must be a tensor that requires no gradient, got 0.5"),
         ("run_state", lambda p: {"x": p[:2].requires_grad_()}, "'x'.* must be a tensor that requires no gradient"),
     ],
-)
+)  # fmt: skip
 def test_what_a_checkpoint_could_not_give_back_is_refused(where, stored, message):
     strategy, params = Darker(), {"means": torch.zeros(30, 3)}
     getattr(strategy, where).update(stored(params["means"]))
@@ -901,15 +864,6 @@ def test_a_strategy_draws_raw_parameters_as_the_run_does_and_gets_their_gradient
     state.conductor.on_fit_end()
     assert not state.conductor.views
     leaves = state.field.raw()
-    assert torch.equal(
-        strategy.splats(leaves).scales, leaves["scales"].exp()
-    )  # without the field, whose memory is free
-
-
-def test_a_host_activates_raw_parameters_by_exp_and_sigmoid():
-    params = {**field_and_view()[0].raw()}
-    conductor = Conductor(strategy := Darker())
-    conductor.on_fit_start(1, 0)
-    splats = strategy.splats(params)
-    assert torch.equal(splats.scales, params["scales"].exp())
-    assert torch.equal(splats.opacities, params["opacities"].sigmoid())
+    splats = strategy.splats(leaves)  # without the field, whose memory is free; as in a host
+    assert torch.equal(splats.scales, leaves["scales"].exp())
+    assert torch.equal(splats.opacities, leaves["opacities"].sigmoid())
