@@ -114,18 +114,6 @@ def test_an_adam_of_all_parameters_makes_one_extra_step_which_a_scaler_of_losses
         assert torch.allclose(p, scaled[0][name], rtol=0, atol=1e-6), name
 
 
-def test_a_parameter_that_a_loop_has_frozen_stays_on_an_extra_view():
-    trainer = Host(toy.scene(20))
-    _, _, render = started(toy.ShowsDark(), host=trainer)
-    means = trainer.splats["means"]
-    for i in range(2):
-        before = means.detach().clone()
-        means.requires_grad_(i == 0)
-        render(i).mean().backward()
-        trainer.step()
-        assert torch.equal(means, before) == (i == 1)  # which Adam's moments would move
-
-
 def test_a_step_on_an_extra_view_moves_the_gaussians_alone_and_leaves_gradients_to_the_loop():
     trainer, exposure = Host(toy.scene(20)), torch.nn.Parameter(torch.ones(1))
     one = torch.optim.SGD([*trainer.splats.values(), exposure], lr=0.5)
