@@ -424,15 +424,12 @@ def test_a_densifier_that_moves_gaussians_must_say_so():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (
-            lambda n: Doubles(n, told=lambda parents: None),
-            "resized.parents. after a change of structure, here from 16 to 32",
-        ),
+        (lambda n: Doubles(n, told=lambda parents: None), "resized.parents. after a change of structure, here from 16 to 32"),
         (lambda n: Doubles(n, told=lambda parents: parents[1:]), "resized.parents. with the 32 rows .* got 31"),
         (lambda n: Doubles(n, gathers=lambda parents: parents[:16]), "resized.parents. with the 16 rows .* got 32"),
     ],
     ids=["untold", "other parents", "another field"],
-)
+)  # fmt: skip
 def test_a_densifier_that_leaves_others_behind_is_refused(make, message):
     state = brings(make)
     iterate(state, toy.RASTERIZER)
