@@ -3,6 +3,7 @@
 import functools
 from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -369,7 +370,8 @@ def test_a_detail_feature_whose_ten_gradients_no_optimizer_steps_on_gives_a_warn
     stepped, accumulation, objective, warnings, caplog
 ):
     conductor = Conductor(P2G(patch=4), objective=objective, statistics_from=0)  # HR is drawn without λ_HR, too
-    host, clear, render = started(conductor=conductor, accumulation=accumulation)
+    densifier = SimpleNamespace(grow_grad2d=2e-4, refine_stop_iter=10**6)  # which reads P2G's score
+    host, clear, render = started(conductor=conductor, accumulation=accumulation, strategy=densifier)
     for i in range(12):
         render(i % 3).mean().backward()
         if (i + 1) % accumulation == 0:
