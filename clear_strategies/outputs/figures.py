@@ -227,48 +227,40 @@ class _Sheet:
         return x / self._width, 1 - (y + h) / self._height, w / self._width, h / self._height
 
 
-class _Layout:
-    """Where a contact sheet has its elements, px; the last of `lefts` and `tops` is the end of the images."""
-
-    def __init__(self, rows: Sequence[SheetRow]) -> None:
-        self.columns = list(dict.fromkeys(column for row in rows for column in row.images))
-        h, w = (max(image.shape[axis] for row in rows for image in row.images.values()) for axis in (0, 1))
-        self.times = times = magnification(h, w)
-        self.cell_h, self.cell_w = round(times * h), round(times * w)
-        self.parts = [row.part() for row in rows]
-        self.zoom = 1 if times < 1 else int(times) * _ENLARGED  # of the parts
-        self.part_h = [0 if part is None else self.zoom * (part[0].stop - part[0].start) + _GAP for part in self.parts]
-        size = max(len(self.columns) * self.cell_w, len(rows) * self.cell_h + sum(self.part_h))
-        self.larger = max(1.0, size / _SCREEN)
-        self.line = line = round(_LINE * self.larger)
-        self.heads = [textwrap.wrap(column, round(self.cell_w / 7 / self.larger)) or [""] for column in self.columns]
-        self.lefts = [2 * line + i * (self.cell_w + _GAP) for i in range(len(self.columns) + 1)]
-        top, pitch = (4 + max(map(len, self.heads))) * line, self.cell_h + 2 * line + _GAP
-        self.tops = [top + j * pitch + sum(self.part_h[:j]) for j in range(len(rows) + 1)]
-
-
 def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: str = "") -> None:
     """Draw the rows below the names of their columns, a colour bar beside them if there are errors, and `note` below them."""
-    at, error = _Layout(rows), None
-    with_bar = any(image.ndim == 2 for row in rows for image in row.images.values())
-    height = at.tops[-1] + at.line
-    sheet = _Sheet(at.lefts[-1] + 5 * at.line * with_bar, height, at.larger)
-    sheet.text(_GAP, 1.5 * at.line, title, 12, ha="left")
-    for x, column, head in zip(at.lefts, at.columns, at.heads, strict=False):
-        sheet.text(x + at.cell_w / 2, at.tops[0] - at.line / 2, "\n".join(head), 10, va="bottom")
-        for y, row, part, below in zip(at.tops, rows, at.parts, at.part_h, strict=False):
+    columns = list(dict.fromkeys(column for row in rows for column in row.images))
+    h, w = (max(image.shape[axis] for row in rows for image in row.images.values()) for axis in (0, 1))
+    times = magnification(h, w)
+    cell_h, cell_w = round(times * h), round(times * w)
+    parts = [row.part() for row in rows]
+    zoom = 1 if times < 1 else int(times) * _ENLARGED  # of the parts
+    below = [0 if part is None else zoom * (part[0].stop - part[0].start) + _GAP for part in parts]  # their heights
+    larger = max(1.0, max(len(columns) * cell_w, len(rows) * cell_h + sum(below)) / _SCREEN)
+    line = round(_LINE * larger)
+    heads = [textwrap.wrap(column, round(cell_w / 7 / larger)) or [""] for column in columns]
+    lefts = [2 * line + i * (cell_w + _GAP) for i in range(len(columns) + 1)]  # the last is the end of the images
+    top, pitch = (4 + max(map(len, heads))) * line, cell_h + 2 * line + _GAP
+    tops = [top + j * pitch + sum(below[:j]) for j in range(len(rows) + 1)]
+    with_bar, error = any(image.ndim == 2 for row in rows for image in row.images.values()), None
+    height = tops[-1] + line
+    sheet = _Sheet(lefts[-1] + 5 * line * with_bar, height, larger)
+    sheet.text(_GAP, 1.5 * line, title, 12, ha="left")
+    for x, column, head in zip(lefts, columns, heads, strict=False):
+        sheet.text(x + cell_w / 2, top - line / 2, "\n".join(head), 10, va="bottom")
+        for y, row, part, part_h in zip(tops, rows, parts, below, strict=False):
             if (pixels := row.images.get(column)) is not None:
-                drawn = sheet.image(_resized(pixels, at.times), x, y, **_ERRORS)
+                drawn = sheet.image(_resized(pixels, times), x, y, **_ERRORS)
                 error = drawn if pixels.ndim == 2 else error
                 if part is not None:
-                    sheet.image(_resized(pixels[part], at.zoom), x, y + at.cell_h + _GAP, **_ERRORS)
-                    sheet.outline(part, at.times, x, y)
-            sheet.text(x + at.cell_w / 2, y + at.cell_h + below + at.line, row.captions.get(column, ""))
-    for y, row in zip(at.tops, rows, strict=False):
-        sheet.text(at.line, y + at.cell_h / 2, row.name, rotation=90, color=FAINT)
-    sheet.text(at.lefts[0], height - at.line, note, ha="left", color=FAINT)
+                    sheet.image(_resized(pixels[part], zoom), x, y + cell_h + _GAP, **_ERRORS)
+                    sheet.outline(part, times, x, y)
+            sheet.text(x + cell_w / 2, y + cell_h + part_h + line, row.captions.get(column, ""))
+    for y, row in zip(tops, rows, strict=False):
+        sheet.text(line, y + cell_h / 2, row.name, rotation=90, color=FAINT)
+    sheet.text(lefts[0], height - line, note, ha="left", color=FAINT)
     if error is not None:
-        sheet.color_bar(error, at.lefts[-1], at.tops[0], at.cell_h)
+        sheet.color_bar(error, lefts[-1], top, cell_h)
     save(sheet.figure, path)
 
 
