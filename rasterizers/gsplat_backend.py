@@ -15,8 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.backend import Backend
-from rasterizers.checks import require_cotangents, require_finite_splats, require_splats
+from rasterizers.backend import Backend, require_cotangents, require_finite_splats, require_splats
 from rasterizers.geometry import SH_C0, spherical_harmonics
 from rasterizers.interface import BackendUnavailable, Camera, Rendering, SplatGradients, Splats, Traits
 

@@ -20,8 +20,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.dlpack import from_dlpack
 
-from rasterizers.backend import Backend, of_accumulated, packed_rows
-from rasterizers.checks import require_cotangents, require_finite_splats, require_splats
+from rasterizers.backend import (
+    Backend,
+    of_accumulated,
+    packed_rows,
+    require_cotangents,
+    require_finite_splats,
+    require_splats,
+)
 from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
 from rasterizers.native import load_kernels, threads
 

@@ -17,8 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.backend import Backend, of_accumulated
-from rasterizers.checks import require_cotangents, require_finite_splats, require_splats
+from rasterizers.backend import Backend, of_accumulated, require_cotangents, require_finite_splats, require_splats
 from rasterizers.interface import Camera, Rendering, SplatGradients, Splats, Traits
 from rasterizers.reference.blend import blend, blend_vjp
 from rasterizers.reference.projection import project

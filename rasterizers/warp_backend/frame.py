@@ -23,8 +23,7 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from rasterizers.backend import packed_rows
-from rasterizers.checks import require_cotangents, require_finite_splats, require_splats
+from rasterizers.backend import packed_rows, require_cotangents, require_finite_splats, require_splats
 from rasterizers.geometry import tangent_limits
 from rasterizers.interface import Camera, SplatGradients, Splats
 from rasterizers.recording import running
