@@ -39,7 +39,6 @@ _PLACE: Final = re.compile(r"data\.(path|root|reader\.(root|cache)|views\.lr_fol
 # A file, such as initial points or a network, has its digest beside the key of its path.
 _FILE: Final = ".path"
 _DIGEST: Final = " digest"
-_DIGEST_EARLIER: Final = (" content", " holds")  # of earlier versions, also of folders
 _ROUNDED: Final = 1e-6  # relative error of a position in float32
 _SAME: Final = 1e-3  # relative to a camera's focal length, and to the distances between the cameras
 _SAME_COLOUR: Final = 5e-4  # more than rounding and decoding differ between machines
@@ -141,7 +140,7 @@ def require_same(source: Path, then: Mapping[str, Any], now: Mapping[str, Any]) 
     keys = then.keys() | now.keys()
     moved = {key for key in keys if key + _DIGEST in then and key + _DIGEST in now}  # their content is compared
     moved |= {*filter(_PLACE.fullmatch, keys)} if (folder_of(source) / CAMERAS).is_file() else set()
-    moved |= {key for key in then.keys() ^ now.keys() if key.endswith((_DIGEST, *_DIGEST_EARLIER))}
+    moved |= {key for key in then.keys() ^ now.keys() if key.endswith(_DIGEST)}
     differ = [key for key in sorted(keys - moved) if then.get(key) != now.get(key)]
     if differ:
         listed = "; ".join(f"{key}: {then.get(key)!r} then, {now.get(key)!r} now" for key in differ[:5])
@@ -172,13 +171,12 @@ def _require_same_cameras(source: Path, scene: Scene) -> None:
 
 
 def _require_same_photos(source: Path, saved: Checkpoint, photos: Mapping[str, Tensor]) -> None:
-    """Raise a DataError if photos, masks or SR images have changed; checkpoints of earlier versions have fewer fingerprints."""
-    now = {name: (saved.tensors.get(f"{PHOTOS}/{name}", x), x) for name, x in photos.items()}
-    if changed := [name for name, (a, b) in now.items() if not _same_colours(a, b)]:
-        problem = f"{len(changed)} of {len(now)} have another content, mask or SR image than in this run, such as {changed[0]}"
+    """Raise a DataError if photos, masks or SR images have changed."""
+
+    def same(name: str, now: Tensor) -> bool:
+        then = saved.tensors.get(f"{PHOTOS}/{name}")
+        return then is not None and then.shape == now.shape and torch.allclose(then, now, rtol=0, atol=_SAME_COLOUR)
+
+    if changed := [name for name, now in photos.items() if not same(name, now)]:
+        problem = f"{len(changed)} of {len(photos)} have another content, mask or SR image than in this run, such as {changed[0]}"
         raise DataError(source, "photos", problem, "give the photos and SR images of this run, or start a new run")
-
-
-def _same_colours(a: Tensor, b: Tensor) -> bool:
-    both = min(len(a), len(b))
-    return a.shape[1:] == b.shape[1:] and float((a[:both].double() - b[:both].double()).abs().max()) <= _SAME_COLOUR
