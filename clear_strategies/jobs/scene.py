@@ -78,12 +78,6 @@ PriorSettings = AutoPrior | Callable[..., Any]
 """`auto`, a `Prior`, or a function that makes one from the HR photos: `_partial_` in conf/prior."""
 
 
-def require_factor(prior: PriorSettings, factor: int) -> None:
-    """Raise a SettingError if it is known beforehand that the prior cannot enlarge by this factor."""
-    if isinstance(network := network_of(prior), Ncnn):
-        network.require_factor(factor)
-
-
 def load(
     data: DataSettings, prior: PriorSettings, seed: int, decorate: Callable[[Prior], Prior] = lambda prior: prior
 ) -> Scene:

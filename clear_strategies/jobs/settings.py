@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from clear_strategies.compose import ConductorSettings
-from clear_strategies.data.priors import Bicubic, Prior
+from clear_strategies.data.priors import Bicubic, Ncnn, Prior, network_of
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import device, scene
 from clear_strategies.jobs.device import RasterizerSettings
@@ -49,7 +49,8 @@ class JobSettings(ConductorSettings):
             )
         for decorate in self.decorators.values():
             decorate(Bicubic())  # checks its settings, too
-        scene.require_factor(self.prior, self.data.views.sr_scale)
+        if isinstance(network := network_of(self.prior), Ncnn):
+            network.require_factor(self.data.views.sr_scale)
 
 
 def settings_of(values: Mapping[str, Any]) -> JobSettings:

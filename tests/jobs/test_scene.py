@@ -21,7 +21,7 @@ from clear_strategies.data.view_settings import ViewSettings, split
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.jobs import job
 from clear_strategies.jobs.saved import open_splat
-from clear_strategies.jobs.scene import AutoPrior, DataSettings, load, read, require_factor
+from clear_strategies.jobs.scene import AutoPrior, DataSettings, load, read
 from clear_strategies.jobs.settings import JobSettings, settings_of
 from tests.helpers import captures, fake_ncnn, forked
 from tests.helpers.command_line import ALONE
@@ -122,9 +122,10 @@ def test_a_factor_that_the_network_has_not_and_a_prior_without_a_label_are_refus
         values = tree(composed(f"prior={prior}", "data.views.sr_scale=3"))
         with pytest.raises(SettingError, match=rf"^data\.views\.sr_scale: must be (2 or )?4 with {prior}, got 3: "):
             settings_of(values)
-    require_factor(Corrupted(Ncnn()), 2)
+    settings = settings_of(tree(composed("data.views.sr_scale=2")))
+    replace(settings, prior=Corrupted(Ncnn()))
     with pytest.raises(SettingError, match="must be 4 with realesrgan, got 2"):
-        require_factor(Corrupted(Ncnn("realesrgan")), 2)
+        replace(settings, prior=Corrupted(Ncnn("realesrgan")))
     with pytest.raises(SettingError, match="prior: Unlabelled is no Prior: it needs the property label"):
         settings_of(tree(composed(f"prior._target_={__name__}.Unlabelled")))
 
