@@ -106,14 +106,13 @@ class Camera:
                 f"{self.width}x{self.height} times {factor} is not a whole number of pixels; "
                 f"crop the image to a multiple of {1 / factor:g} first."
             )
+        return self.resized(round(width), round(height))
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera with an image of width × height pixels, each axis by its own ratio."""
+        x, y = width / self.width, height / self.height
         return replace(
-            self,
-            fx=self.fx * factor,
-            fy=self.fy * factor,
-            cx=self.cx * factor,
-            cy=self.cy * factor,
-            width=round(width),
-            height=round(height),
+            self, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y, width=width, height=height
         )
 
 

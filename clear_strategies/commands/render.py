@@ -32,7 +32,6 @@ def main(arguments: Sequence[str]) -> None:
 
     from clear_strategies.core.images import to_bytes
     from clear_strategies.data.photo_files import write_png
-    from clear_strategies.data.view_settings import resized
     from clear_strategies.jobs.saved import open_splat
     from clear_strategies.outputs.figures import spaced
     from clear_strategies.viewing.cameras import at_most
@@ -43,7 +42,7 @@ def main(arguments: Sequence[str]) -> None:
     painter = splat.painter
     cameras, width = cameras_of(splat, options.path, options.frames), options.width
     if width is not None:
-        cameras = {name: resized(c, width, max(1, round(c.height * width / c.width))) for name, c in cameras.items()}
+        cameras = {name: c.resized(width, max(1, round(c.height * width / c.width))) for name, c in cameras.items()}
     if options.path == _LOOP:
         cameras = {name: at_most(c, None if width is not None else _LONGEST) for name, c in cameras.items()}
     kinds: dict[str, Callable[[Camera], Pixels]] = {"": lambda camera: to_bytes(painter.color(camera))}

@@ -31,7 +31,7 @@ from clear_strategies.data.priors.interface import kept_network_of, super_resolv
 from clear_strategies.data.scene import Scene, require_shown
 from clear_strategies.data.scene_notes import scene_notes, size_of
 from clear_strategies.data.view_names import ViewFiles, write_pngs
-from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split
+from clear_strategies.data.view_settings import ViewSettings, lr_size, split
 from clear_strategies.errors import DataError
 from clear_strategies.geometry.cameras import centers_of
 from clear_strategies.geometry.exposure import exposure_gains
@@ -216,7 +216,7 @@ def _sized(photo: Photo, views: ViewSettings) -> Photo:
     multiple = 1 if views.photos_are == "lr" else views.sr_scale
     if views.sizes == "round":
         width, height = (multiple * size for size in lr_size(photo.camera, views))
-        return photo.resized(resized(photo.camera, width, height), views.downsample)
+        return photo.resized(photo.camera.resized(width, height), views.downsample)
     whole = photo.cropped(views.shrink * multiple)
     return whole.resized(whole.camera.scaled(1 / views.shrink), views.downsample)
 

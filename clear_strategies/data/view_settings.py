@@ -120,14 +120,6 @@ def lr_size(camera: Camera, views: ViewSettings) -> tuple[int, int]:
     return width, height
 
 
-def resized(camera: Camera, width: int, height: int) -> Camera:
-    """Rescale a camera to width × height pixels, each axis by its own ratio."""
-    x, y = width / camera.width, height / camera.height
-    return replace(
-        camera, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y, width=width, height=height
-    )
-
-
 def _only(capture: Capture, names: Sequence[str], wanted: str) -> str:
     """The only name that matches `wanted`, of `train_names`; a DataError if there is none or several."""
     match matching(names, wanted):
@@ -206,5 +198,5 @@ def _noted(capture: Capture, why: str) -> Capture:
 def _reduced(frame: Frame, ratio: float, multiple: int, kernel: DownKernel) -> Frame:
     """The frame with a photo `ratio` times smaller, rounded to a size that `multiple` divides."""
     width, height = (max(1, round(s / ratio / multiple)) * multiple for s in (frame.camera.width, frame.camera.height))
-    camera = resized(frame.camera, width, height)
+    camera = frame.camera.resized(width, height)
     return replace(frame, camera=camera, load=lambda: frame.load().resized(camera, kernel, layers="area"))

@@ -22,7 +22,6 @@ from clear_strategies.data import strict_json
 from clear_strategies.data.capture import rigid_inverse
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.strict_json import Number, typed
-from clear_strategies.data.view_settings import resized
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera, Color
 
@@ -100,7 +99,7 @@ def at_most(camera: Camera, longest: int | None) -> Camera:
     """Rescale a camera to even numbers of pixels, as videos need them, and a longer edge of at most `longest` pixels."""
     edge = max(camera.width, camera.height)
     times = 1.0 if longest is None else min(1.0, longest / edge)
-    return resized(camera, *(max(2, 2 * round(times * size / 2)) for size in (camera.width, camera.height)))
+    return camera.resized(*(max(2, 2 * round(times * size / 2)) for size in (camera.width, camera.height)))
 
 
 def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:

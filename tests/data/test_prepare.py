@@ -12,7 +12,7 @@ from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.prepare import check_headers, prepare, save_lr
 from clear_strategies.data.priors import Bicubic, Images
-from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split, within_limit
+from clear_strategies.data.view_settings import ViewSettings, lr_size, split, within_limit
 from clear_strategies.errors import DataError, SettingError
 from rasterizers import Camera
 from tests.helpers.captures import POINTS_AT_RANDOM as POINTS
@@ -71,7 +71,7 @@ def test_photos_get_the_published_sizes(scene):
     full, lr, hr = SIZES[scene]
     photo = Camera(torch.eye(4), 1.0, 1.0, 1.0, 1.0, *full)
     assert lr_size(photo, papers(shrink=2, sizes="round")) == lr
-    camera = resized(photo, *hr)
+    camera = photo.resized(*hr)
     assert (camera.scaled(1 / 4).width, camera.scaled(1 / 4).height) == lr
 
 
