@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,7 +21,6 @@ from rasterizers.interface import BackendUnavailable, Camera, Rendering, SplatGr
 
 _FIXED: Final = {"alpha_min": (1 / 255,), "alpha_max": (0.999, 0.99), "transmittance_min": (1e-4,)}
 """The values that a setting may have; 0.99, the default of RasterSettings, is drawn as 0.999."""
-_TRAITS: Final = Traits(devices=frozenset({"cuda"}), dtypes=frozenset({torch.float32}), depth=True)
 
 
 def _gsplat_rasterization() -> Callable[..., Any]:
@@ -48,6 +47,8 @@ class GsplatRasterizer(Backend):
         ValueError: a setting is out of range, or a cut-off is not the default, which gsplat cannot change.
     """
 
+    traits: ClassVar[Traits] = Traits(devices=frozenset({"cuda"}), dtypes=frozenset({torch.float32}), depth=True)
+
     def __post_init__(self) -> None:
         Backend.__post_init__(self)
         for name, fixed in _FIXED.items():
@@ -57,16 +58,12 @@ class GsplatRasterizer(Backend):
                 )
         _gsplat_rasterization()
 
-    @property
-    def traits(self) -> Traits:
-        return _TRAITS
-
     def draw(self, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> list[Rendering]:
         """Jobs share nothing; depth is drawn by gsplat's render mode "RGB+ED"."""
         return [self._drawn(*job, z) for job, z in zip(jobs, depth, strict=True)]
 
     def _drawn(self, splats: Splats, camera: Camera, depth: bool) -> GsplatRendering:
-        require_splats(splats, _TRAITS)
+        require_splats(splats, self.traits)
         require_finite_splats(splats)
         names = ("means", "quats", "scales", "opacities")
         with torch.enable_grad():

@@ -111,9 +111,7 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The same camera with an image of width × height pixels, each axis by its own ratio."""
         x, y = width / self.width, height / self.height
-        return replace(
-            self, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y, width=width, height=height
-        )
+        return replace(self, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y, width=width, height=height)
 
 
 def _is_rigid(world_to_camera: list[list[float]]) -> bool:

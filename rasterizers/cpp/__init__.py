@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from itertools import chain
-from typing import Final
+from typing import ClassVar, Final
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -31,15 +31,6 @@ from rasterizers.backend import (
 from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
 from rasterizers.native import load_kernels, threads
 
-_TRAITS: Final = Traits(
-    devices=frozenset({"cpu"}),
-    dtypes=frozenset({torch.float32, torch.float64}),
-    native_threads=True,
-    depth=True,
-    absgrad=True,
-    depth_gradient=True,
-    radii=True,
-)
 _LONGEST_SIDE: Final = 32 << 15  # px: bins of 32 px are numbered in 16 bits
 
 
@@ -58,6 +49,16 @@ class CppRasterizer(Backend):
         ValueError: a setting is out of range.
     """
 
+    traits: ClassVar[Traits] = Traits(
+        devices=frozenset({"cpu"}),
+        dtypes=frozenset({torch.float32, torch.float64}),
+        native_threads=True,
+        depth=True,
+        absgrad=True,
+        depth_gradient=True,
+        radii=True,
+    )
+
     memory: int = 4096
     threads: int | None = None
     isa: str | None = None
@@ -75,10 +76,6 @@ class CppRasterizer(Backend):
         """The instruction set of the kernels in float32."""
         return str(load_kernels(__name__, self.isa).isa)
 
-    @property
-    def traits(self) -> Traits:
-        return _TRAITS
-
     def draw(self, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> list[Rendering]:
         """Jobs of one pose share projection, colour and depth order."""
         frame = _Frame(self, jobs)
@@ -91,7 +88,7 @@ class _Frame:
     def __init__(self, settings: CppRasterizer, jobs: Sequence[tuple[Splats, Camera]]) -> None:
         splats, camera = jobs[0]
         for job, view in jobs:
-            require_splats(job, _TRAITS)
+            require_splats(job, settings.traits)
             if max(view.width, view.height) > _LONGEST_SIDE:
                 raise ValueError(
                     f"the cpp rasterizer draws images of up to {_LONGEST_SIDE} px a side, got {view.width}x{view.height}."

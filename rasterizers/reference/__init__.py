@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,13 +23,6 @@ from rasterizers.reference.blend import blend, blend_vjp
 from rasterizers.reference.projection import project
 from rasterizers.reference.tiles import TileGrid, list_tiles
 
-_TRAITS: Final = Traits(
-    devices=frozenset({"cpu", "cuda"}),
-    dtypes=frozenset({torch.float32, torch.float64}),
-    depth=True,
-    absgrad=True,
-    depth_gradient=True,
-)
 _TILE: Final = 8  # px; takes half the time of 16 in torch
 
 
@@ -41,16 +34,20 @@ class ReferenceRasterizer(Backend):
         lanes: pairs of pixel and Gaussian that are blended at a time, 16 to 100 bytes each.
     """
 
+    traits: ClassVar[Traits] = Traits(
+        devices=frozenset({"cpu", "cuda"}),
+        dtypes=frozenset({torch.float32, torch.float64}),
+        depth=True,
+        absgrad=True,
+        depth_gradient=True,
+    )
+
     lanes: int = 1 << 19
 
     def __post_init__(self) -> None:
         Backend.__post_init__(self)
         if self.lanes < 1:
             raise ValueError(f"lanes must be at least 1 pair, got {self.lanes}.")
-
-    @property
-    def traits(self) -> Traits:
-        return _TRAITS
 
     def draw(self, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> list[Rendering]:
         """Jobs share nothing."""
@@ -61,7 +58,7 @@ class ReferenceRendering:
     """The image, and the tile lists that its VJP reads again."""
 
     def __init__(self, settings: ReferenceRasterizer, splats: Splats, camera: Camera, *, depth: bool) -> None:
-        require_splats(splats, _TRAITS)
+        require_splats(splats, settings.traits)
         require_finite_splats(splats)
         self._settings = settings
         self._grid = grid = TileGrid(camera.width, camera.height, _TILE)
