@@ -120,7 +120,8 @@ def test_doctor_names_versions_memory_backends_and_missing_extras(capsys, monkey
 def test_gsplat_which_has_cut_offs_of_its_own_alone_is_tested_by_them(capsys, monkeypatch):
     ours, on_cpu = partial(rasterizers.rasterization, backend="torch"), frozenset({"cpu"})
     monkeypatch.setattr(gsplat_backend, "_gsplat_rasterization", lambda: ours)
-    monkeypatch.setattr(gsplat_backend, "_TRAITS", replace(gsplat_backend._TRAITS, devices=on_cpu))
+    gsplat = gsplat_backend.GsplatRasterizer
+    monkeypatch.setattr(gsplat, "traits", replace(gsplat.traits, devices=on_cpu))
     monkeypatch.setattr(rasterizers, "names", lambda: ["gsplat"])
     doctor.main([])
     assert f"{'gsplat':32}works: differs from the reference by" in capsys.readouterr().out

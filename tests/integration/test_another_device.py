@@ -77,7 +77,8 @@ def few(*photos):
     points = stereo(*photos)
     return replace(points, means=points.means[:60], colors=points.colors[:60])
 
-rasterizers.reference._TRAITS = replace(rasterizers.reference._TRAITS, devices=frozenset({"cpu", NAME}))
+reference = rasterizers.reference.ReferenceRasterizer
+reference.traits = replace(reference.traits, devices=frozenset({"cpu", NAME}))
 torch.Generator = lambda _="cpu": generator()  # there are none for the other device
 gsplat_loop.stereo = few
 gsplat_loop.load_demo = lambda device: load_demo(64, 48, device=NAME)

@@ -120,7 +120,7 @@ def stand_in(monkeypatch):
 @pytest.fixture
 def gsplat(monkeypatch, stand_in):
     """The same on a CPU."""
-    monkeypatch.setattr(gsplat_backend, "_TRAITS", replace(gsplat_backend._TRAITS, devices=frozenset({"cpu"})))
+    monkeypatch.setattr(GsplatRasterizer, "traits", replace(GsplatRasterizer.traits, devices=frozenset({"cpu"})))
     return stand_in
 
 
