@@ -35,6 +35,7 @@ _TINY: Final = torch.finfo(torch.float64).tiny
 # A Gaussian whose axes are equally long does not change when it is rotated: in exact arithmetic its rotation gradient is 0, in
 # floating point it is noise that would "conflict" one time in five.
 _ROTATION_NOISE: Final = 2.0**-18
+_CANCELLED: Final = 2.0**-20  # ‖ĝ_HR‖² / ‖g_HR‖² at least: what is left of less is rounding, and not to be enlarged
 
 
 @dataclass(frozen=True)
@@ -48,10 +49,12 @@ class GCO(Strategy):
         whole: compare a Gaussian as a whole instead, all groups together. Neither this nor `drop` is the paper's; see
             experiment=claims.
         drop: leave out a conflicting HR gradient instead of correcting it.
+        keep_length: without evidence, scale ĝ_HR to the length of g_HR: what opposes LR is turned and not weakened, since nothing
+            tells that it is wrong. False: the paper's (F31).
 
     There is no ε: products are in float64, where those of float32 gradients do not vanish, and a zero norm is no conflict (F27).
     The opacity group has one dimension: its cosine is ±1, so every disagreement is a full conflict.
-    Without evidence q = 0, and the LR gradient prevails (F32): by default 0.29 of an opposite HR gradient is left.
+    Without evidence q = 0 (F32). As the paper has it, LR then prevails: 0.29 of an opposite HR gradient is left.
 
     Raises:
         SettingError: a setting is outside its range.
@@ -63,6 +66,7 @@ class GCO(Strategy):
     groups: Sequence[str] = CONFLICT_GROUPS
     whole: bool = False
     drop: bool = False
+    keep_length: bool = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "groups", tuple(self.groups))
@@ -98,7 +102,12 @@ class GCO(Strategy):
         self._report(p, below, ω, evidence is not None)
         if self.drop:
             return Weights(keep=(below == 0).double())
-        return Weights(remove=per_norm.mul_(h2).mul_(below).mul_(ω))  # ω (c + τ_c) ‖h‖ / ‖l‖, Eq. 7
+        remove = per_norm.mul_(h2).mul_(below).mul_(ω)  # ω (c + τ_c) ‖h‖ / ‖l‖, Eq. 7
+        if evidence is not None or not self.keep_length:
+            return Weights(remove=remove)
+        u = times(below, ω)  # ‖ĝ_HR‖² / ‖g_HR‖² = 1 + u (u - 2 c), where c = below - τ_c
+        keep = times(u, u.sub(below, alpha=2).add_(2 * τ)).add_(1).clamp_min_(_CANCELLED).rsqrt_()
+        return Weights(keep, remove.mul_(keep))
 
     def _together(self, of_groups: Float[Tensor, "N G"]) -> Float[Tensor, "N G"]:
         """The sum over the groups that are compared, in the place of each."""
@@ -114,10 +123,10 @@ class GCO(Strategy):
                 "Set strategies.gco.groups.", ", ".join(self.groups), ", ".join(p.names),
             )  # fmt: skip
             return
-        if not has_evidence:
+        if not (has_evidence or self.keep_length):
             self._log_once(
                 logging.INFO, "GCO corrects without evidence: LR prevails in every conflict, which costs PSNR if most of the SR "
-                "detail is right. With p2g it spares patches whose SR image agrees with the photo.",
+                "detail is right. Set strategies.gco.keep_length=true, or add p2g.",
             )  # fmt: skip
 
         @cache

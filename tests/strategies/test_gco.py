@@ -32,16 +32,17 @@ def test_values_worked_out_by_hand_which_reliability_softens_down_to_the_lower_b
     # l = (1, 0, 0), h = (-3, 4, 0): c = -3/5, d = -3 + 0.05·5 = -2.75, s = (0.6 - 0.05) / 0.95.
     l, h = torch.tensor([1.0, 0, 0]), torch.tensor([-3.0, 4, 0])
     step = None if q is None else toy.step(evidence=Evidence(torch.tensor([q]), torch.tensor([1.0])))
-    result = GCO().correct(grads("means", l), grads("means", h), step)["means"][0]
+    result = GCO(keep_length=False).correct(grads("means", l), grads("means", h), step)["means"][0]
     assert result.tolist() == pytest.approx([-3 + omega * 2.75, 4, 0], rel=1e-6)
 
 
 def test_without_evidence_it_says_once_that_lr_prevails(caplog):
-    """An opposite HR gradient keeps 1 - 0.75 * 0.95 of its length, whichever of the two is longer."""
+    """As the paper has it, an opposite HR gradient keeps 1 - 0.75 * 0.95 of its length, whichever of the two is longer."""
     caplog.set_level("INFO")
-    lr, gco = Grads({"means": torch.tensor([[2.0, 0, 0], [0.5, 0, 0]])}), GCO()
+    lr, gco = Grads({"means": torch.tensor([[2.0, 0, 0], [0.5, 0, 0]])}), GCO(keep_length=False)
     hr = Grads({"means": torch.tensor([[-1.0, 0, 0], [-4.0, 0, 0]])})
     gco.correct(lr, hr, toy.step(evidence=Evidence(torch.zeros(2), torch.ones(2))))
+    GCO().correct(lr, hr)
     assert not caplog.messages
     for t in (1, 2):
         left = gco.correct(lr, hr, toy.step(t))["means"][:, 0] / hr["means"][:, 0]
@@ -54,38 +55,56 @@ def test_without_evidence_it_says_once_that_lr_prevails(caplog):
     ] * 2
 
 
-def by_the_equations(lr: Grads, hr: Grads, group: str, q: Tensor, s: GCO) -> tuple[Tensor, Tensor, Tensor]:
-    """Eq. 6, 7 and 11 of a group in float64: the corrected rows, which of them conflict, and ω."""
+@pytest.mark.parametrize("group", CONFLICT_GROUPS)
+def test_without_evidence_what_is_turned_keeps_its_length_and_with_evidence_it_is_the_papers(group):
+    lr, hr = random_pair(3)
+    turned, shortened = (GCO(keep_length=kept).correct(lr, hr)[group].reshape(200, -1) for kept in (True, False))
+    h = hr[group].reshape(200, -1)
+    assert torch.allclose(turned.norm(dim=1), h.norm(dim=1), rtol=1e-6)
+    assert (shortened.norm(dim=1) < 0.9 * h.norm(dim=1)).any()
+    assert torch.allclose(torch.cosine_similarity(turned, shortened, dim=1), torch.ones(200))
+    step = toy.step(evidence=Evidence(torch.linspace(0, 1, 200), torch.ones(200)))
+    assert torch.equal(*(GCO(keep_length=kept).correct(lr, hr, step)[group] for kept in (True, False)))
+
+
+def by_the_equations(
+    lr: Grads, hr: Grads, group: str, q: Tensor, s: GCO, *, keeps_length: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Eq. 6, 7 and 11 of a group in float64: the corrected rows, their scale, which of them conflict, and ω."""
     compared = s.groups if s.whole else [group]
     l, h = (torch.cat([g[k].double().reshape(len(q), -1) for k in compared], 1) for g in (lr, hr))
     l_norm, h_norm = l.norm(dim=1), h.norm(dim=1)
     c = (l * h).sum(1) / (l_norm * h_norm)  # Eq. 6
     conflicts = (c < -s.tolerance) & (group in s.groups)
     ω = ((-c - s.tolerance) / (1 - s.tolerance) * (1 - q)).clamp(s.weight_min, s.weight_max)  # Eq. 11
+    factor = (ω * (c + s.tolerance) * h_norm / l_norm)[:, None]
+    left = (h - factor * l).norm(dim=1) / h_norm
+    scale = 1 / left.clamp_min(2.0**-10) if keeps_length else torch.ones_like(left)
     l, h = (g[group].double().reshape(len(q), -1) for g in (lr, hr))
-    corrected = h - (ω * (c + s.tolerance) * h_norm / l_norm)[:, None] * l  # Eq. 7
-    return torch.where(conflicts[:, None], 0.0 if s.drop else corrected, h), conflicts, ω
+    corrected = scale[:, None] * (h - factor * l)  # Eq. 7
+    return torch.where(conflicts[:, None], 0.0 if s.drop else corrected, h), scale, conflicts, ω
 
 
 @given(
     seed=st.integers(0, 10_000), tolerance=st.floats(0, 0.9), bounds=st.tuples(st.floats(0, 1), st.floats(0, 1)),
     groups=st.lists(st.sampled_from(CONFLICT_GROUPS), min_size=1, unique=True), whole=st.booleans(), drop=st.booleans(),
-    has_evidence=st.booleans(),
+    has_evidence=st.booleans(), keep_length=st.booleans(),
 )  # fmt: skip
 @settings(max_examples=60, deadline=None)
 def test_the_correction_is_that_of_the_equations_for_any_settings_and_logs_what_it_did(
-    seed, tolerance, bounds, groups, whole, drop, has_evidence
+    seed, tolerance, bounds, groups, whole, drop, has_evidence, keep_length
 ):
     n, (lr, hr) = 60, random_pair(seed, n=60)
-    gco = GCO(tolerance, min(bounds), max(bounds), groups, whole=whole, drop=drop)
+    gco = GCO(tolerance, min(bounds), max(bounds), groups, whole=whole, drop=drop, keep_length=keep_length)
     q = torch.rand(n, generator=torch.Generator().manual_seed(seed)) if has_evidence else torch.zeros(n)
     before = {name: value.clone() for name, value in lr.items()}
     result = gco.correct(lr, hr, toy.step(evidence=Evidence(q, torch.ones(n)) if has_evidence else None))
     of_all = []
     for group in CONFLICT_GROUPS:
-        expected, conflicts, ω = by_the_equations(lr, hr, group, q.double(), gco)
+        kept = keep_length and not has_evidence
+        expected, scale, conflicts, ω = by_the_equations(lr, hr, group, q.double(), gco, keeps_length=kept)
         found = result[group].reshape(n, -1)
-        size = expected.norm(dim=1) + hr[group].double().reshape(n, -1).norm(dim=1)
+        size = expected.norm(dim=1) + scale * hr[group].double().reshape(n, -1).norm(dim=1)
         assert ((found - expected).norm(dim=1) <= 1e-6 * size).all(), group
         assert torch.equal(result[group][~conflicts], hr[group][~conflicts])
         assert torch.equal(lr[group], before[group])

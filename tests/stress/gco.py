@@ -31,7 +31,7 @@ def right(l_row: list[float], h_row: list[float], tau: float, low: float, high: 
 
 def measure(rows: int = 200) -> list[Row]:
     """Random rows of every dimension, with norms from 1e-36 to 1e36."""
-    rule, worst, missed = GCO(), Worst(), Worst()
+    rule, worst, missed = GCO(keep_length=False), Worst(), Worst()
     for d in DIMENSIONS:
         for exponent in range(-36, 37, 6):
             l = vectors(rows, d, exponent, seed=d).float()
