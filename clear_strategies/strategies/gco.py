@@ -105,8 +105,8 @@ class GCO(Strategy):
         remove = per_norm.mul_(h2).mul_(below).mul_(ω)  # ω (c + τ_c) ‖h‖ / ‖l‖, Eq. 7
         if evidence is not None or not self.keep_length:
             return Weights(remove=remove)
-        u = times(below, ω)  # ‖ĝ_HR‖² / ‖g_HR‖² = 1 + u (u - 2 c), where c = below - τ_c
-        keep = times(u, u.sub(below, alpha=2).add_(2 * τ)).add_(1).clamp_min_(_CANCELLED).rsqrt_()
+        u = times(below, ω)  # ‖ĝ_HR‖² / ‖g_HR‖² = 1 + u² - 2 u c, where c = below - τ_c
+        keep = times(u, u).addcmul_(u, below, value=-2).add_(u, alpha=2 * τ).add_(1).clamp_min_(_CANCELLED).rsqrt_()
         return Weights(keep, remove.mul_(keep))
 
     def _together(self, of_groups: Float[Tensor, "N G"]) -> Float[Tensor, "N G"]:
