@@ -864,6 +864,8 @@ def test_a_strategy_draws_raw_parameters_as_the_run_does_and_gets_their_gradient
     state.conductor.on_fit_end()
     assert not state.conductor.views
     leaves = state.field.raw()
-    splats = strategy.splats(leaves)  # without the field, whose memory is free; as in a host
-    assert torch.equal(splats.scales, leaves["scales"].exp())
-    assert torch.equal(splats.opacities, leaves["opacities"].sigmoid())
+    Conductor(in_host := Darker()).on_fit_start(1, 0)
+    for s in (strategy, in_host):  # without the field, whose memory is free
+        splats = s.splats(leaves)
+        assert torch.equal(splats.scales, leaves["scales"].exp())
+        assert torch.equal(splats.opacities, leaves["opacities"].sigmoid())
