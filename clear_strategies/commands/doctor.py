@@ -131,10 +131,15 @@ def _backends(broken: list[str], *, slow: bool) -> Iterator[tuple[str, str]]:
     import torch
 
     import rasterizers
-    from rasterizers import native, testing
-    from rasterizers.interface import Camera
+    from rasterizers import native
+    from rasterizers.interface import Camera, Splats
 
-    splats, camera = testing.scene(300), Camera(torch.eye(4), 58.0, 58.0, 32.0, 32.0, 64, 64)
+    g, shapes = torch.Generator().manual_seed(0), ((3,), (4,), (3,), (), (1, 3), (3, 3))
+    means, quats, scales, opacities, sh0, shN = (torch.randn(300, *shape, generator=g) for shape in shapes)
+    splats = Splats(means, quats, (scales * 0.3 - 2).exp(), opacities.sigmoid(), sh0, shN * 0.2)
+    pose = torch.eye(4)
+    pose[2, 3] = 5
+    camera = Camera(pose, 76.0, 76.0, 32.0, 32.0, 64, 64)
     # For pictures this small, torch's own threads cost more than they bring.
     with native.kernel_threads(native.threads()):
         exact = rasterizers.load("torch")(splats, camera).image  # by the default cut-offs, as gsplat has no others
