@@ -123,8 +123,9 @@ def _table(lines: Mapping[str, str]) -> str:
 
 def _skipped(state: TrainState) -> Iterator[str]:
     """Phrases for the work that this configuration never does."""
-    objective, hr_from = state.conductor.objective, state.conductor.hr_from()
-    if not state.conductor.wants_lr:
+    conductor, objective, collecting = state.conductor, state.conductor.objective, state.conductor.statistics_from
+    hr_from = conductor.hr_from(scored=collecting is not None and state.density.collects(collecting + 1))
+    if not conductor.wants_lr:
         used = "is the area mean of the HR render" if objective.lambda_lr > 0 else "plays no part"
         yield f"LR render (LR {used})"
     if objective.lambda_hf == 0:
@@ -135,7 +136,7 @@ def _skipped(state: TrainState) -> Iterator[str]:
         yield f"HR scale until iteration {hr_from} (lambda_HR = 0)"
     if state.mip.variance == 0:
         yield "3D filter (variance 0)"
-    yield from state.conductor.skips.descriptions(state.views, hr_from=hr_from)
+    yield from conductor.skips.descriptions(state.views, hr_from=hr_from)
 
 
 def _marks(state: TrainState) -> dict[str, int]:

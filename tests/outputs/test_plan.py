@@ -55,7 +55,9 @@ class Quiet(Strategy):
         return f"lambda_HR is at most {lambda_hr:g}" if lambda_hr < 2 else None
 
 
-def test_a_strategy_without_effect_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_strategy_without_effect_is_warned_of(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     state = started(Quiet(), lambda_hr=WarmupDecay(start=0, full=1))
     lines(state, "quiet")
     assert "Quiet has no effect: lambda_HR is at most 1." in caplog.text
@@ -69,6 +71,8 @@ def test_a_strategy_without_effect_is_warned_of(caplog: pytest.LogCaptureFixture
             assert f"{name} has no effect: lambda_HR is 0 throughout." in caplog.text
     assert "HR scale until iteration 500 (lambda_HR = 0)" in found["skipped"]  # P2G's score needs it then
     assert "HR scale throughout (lambda_HR = 0)" in lines(started(GCO(), lambda_hr=idle), "gco")["skipped"]
+    monkeypatch.setattr(type(state.density), "collects", lambda self, t: False)  # as MCMC, which reads no score
+    assert "HR scale throughout (lambda_HR = 0)" in lines(started(P2G(), lambda_hr=idle), "p2g")["skipped"]
 
 
 def test_the_progress_bar_counts_iterations(capsys: pytest.CaptureFixture[str]) -> None:
