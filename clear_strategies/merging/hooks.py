@@ -108,7 +108,7 @@ class Hooks:
             device: of the field. views: all training views, where the caller has them.
             splats: see `Strategy.splats`; None: exp and sigmoid.
         """
-        self.work_log.device, self.views = torch.device(device), tuple(views)
+        self.work_log.device, self.views, self.logs = torch.device(device), tuple(views), IterationLogs(self.strategies)
         # Arithmetic with numpy's numbers overflows.
         self.run = RunFacts(self.work_log.device, int(seed), self.objective.lambda_hr, splats or by_exp_and_sigmoid)
         for s in self.strategies:

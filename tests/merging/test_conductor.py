@@ -342,6 +342,11 @@ def test_what_two_strategies_of_one_class_log_and_add_is_both_there_until_the_ne
     assert conductor.logs.scalars()
     conductor.gate(2, 1)
     assert not conductor.logs.scalars()
+    conductor.regularized(params, 2)
+    conductor.logs.keep()
+    conductor.on_fit_start(1, 0)  # another run, which begins with the iteration in which this one ended
+    conductor.gate(2, 1)
+    assert not conductor.logs.scalars()
     with pytest.raises(AnswerError, match=r"LogsShare.log\('share', …\) takes one number, got a tensor \[2\]"):
         LogsShare(torch.ones(2)).regularize({}, 1)
 
