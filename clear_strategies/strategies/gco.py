@@ -50,7 +50,8 @@ class GCO(Strategy):
             experiment=claims.
         drop: leave out a conflicting HR gradient instead of correcting it.
         keep_length: without evidence, scale ĝ_HR to the length of g_HR: what opposes LR is turned and not weakened, since nothing
-            tells that it is wrong. False: the paper's (F31).
+            tells that it is wrong. What is exactly opposite, as each conflict of opacities, passes as it is. False: the paper's
+            (F31).
 
     There is no ε: products are in float64, where those of float32 gradients do not vanish, and a zero norm is no conflict (F27).
     The opacity group has one dimension: its cosine is ±1, so every disagreement is a full conflict.
@@ -123,7 +124,7 @@ class GCO(Strategy):
                 "Set strategies.gco.groups.", ", ".join(self.groups), ", ".join(p.names),
             )  # fmt: skip
             return
-        if not (has_evidence or self.keep_length):
+        if not (has_evidence or self.keep_length or self.drop):
             self._log_once(
                 logging.INFO, "GCO corrects without evidence: LR prevails in every conflict, which costs PSNR if most of the SR "
                 "detail is right. Set strategies.gco.keep_length=true, or add p2g.",

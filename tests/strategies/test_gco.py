@@ -42,7 +42,8 @@ def test_without_evidence_it_says_once_that_lr_prevails(caplog):
     lr, gco = Grads({"means": torch.tensor([[2.0, 0, 0], [0.5, 0, 0]])}), GCO(keep_length=False)
     hr = Grads({"means": torch.tensor([[-1.0, 0, 0], [-4.0, 0, 0]])})
     gco.correct(lr, hr, toy.step(evidence=Evidence(torch.zeros(2), torch.ones(2))))
-    GCO().correct(lr, hr)
+    GCO(drop=True, keep_length=False).correct(lr, hr)  # no length is kept of what is dropped
+    assert torch.equal(GCO().correct(lr, hr)["means"], hr["means"])  # exactly opposite, so that nothing turns it
     assert not caplog.messages
     for t in (1, 2):
         left = gco.correct(lr, hr, toy.step(t))["means"][:, 0] / hr["means"][:, 0]
