@@ -43,7 +43,7 @@ UNPACKED: Final = set[tuple[str, ...]]()
 
 
 class OwnRasterizerError(HostError, ImportError):
-    """A trainer needs what its own CUDA rasterizer has, and none of the four above; a trainer may do without, by ImportError.
+    """A trainer needs what its own CUDA rasterizer has, and none of those above; a trainer may do without, by ImportError.
 
     Args:
         what: of it the trainer uses.
