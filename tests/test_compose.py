@@ -8,7 +8,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import ConfigCompositionException
 
-from clear_strategies import GCO, P2G, SVS, Conductor, RandomBackground, hydra_app
+from clear_strategies import GCO, P2G, SVS, Conductor, FadingOpacity, RandomBackground, hydra_app
 from clear_strategies import compose as compose_module
 from clear_strategies.compose import conductor, tree
 from clear_strategies.data.priors import BackProjected, Bicubic
@@ -227,6 +227,11 @@ def test_a_host_gets_the_strategies_the_decorators_and_the_rates_of_what_it_name
     assert run.conductor(1.0).prior(Bicubic()) == BackProjected(Bicubic(), down="area")
     assert conductor("clear", iterations=300).detail == DetailRates().of_run(300)
     assert conductor("clear_paper", iterations=300).detail == DetailRates(rate=7.05e-4, steps=0, decay=0.0)
+
+
+def test_opacities_fade_to_a_bound_in_hosts_where_nothing_moves_what_has_faded():
+    assert [s.most for s in conductor("best", "readings=paper").strategies if isinstance(s, FadingOpacity)] == [1_350]
+    assert tree(compose_module.composed(("+strategy=best",), "config"))["strategies"]["fading_opacity"]["most"] == 0
 
 
 def test_in_a_host_best_leaves_mcmc_and_random_backgrounds_out_and_says_so_once_unless_they_are_named(caplog):

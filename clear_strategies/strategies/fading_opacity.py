@@ -22,7 +22,8 @@ from clear_strategies.strategies.base import Strategy
 
 _log = logging.getLogger(__name__)
 
-_FEW_VIEWS: Final = 3  # the whole rate is for at most so many views
+_FEW_VIEWS: Final = 3  # the whole rate is for runs with at most so many views,
+_LONG_RUN: Final = 1_350  # that fade for at least so many iterations
 _LOWEST: Final = -11.5  # an opacity of 1e-5: no renderer draws it, and no gradient reaches it
 
 
@@ -32,11 +33,11 @@ class FadingOpacity(Strategy):
 
     Args:
         rate: share of its opacity that a Gaussian loses in an iteration, in [0, 1). It is for three training views; with more
-            views it is lower in proportion, so that a Gaussian fades equally between two iterations of one view.
+            views it is lower in proportion, so that a Gaussian fades equally between two iterations of one view. It is also
+            lower in proportion if `until` is less than 1,350: opacities start low, and a short run must first raise them.
         until: the last iteration in which opacities fade.
-        steps: the iterations that the rate is for. If `until` is less, the rate is lower in proportion: opacities start low, and
-            a short run must first raise them. If it is greater, all iterations together fade by no more than so many at the whole
-            rate, which removes what no loss needs; more turns surfaces into fog. 0: the rate is for a run of any length.
+        most: all iterations together fade by no more than so many at the whole rate; 0: no bound. By default 1,350 in other
+            trainers, where nothing moves what has faded, as `mcmc` does: more turns surfaces into fog.
 
     Raises:
         SettingError: a setting is outside its range.
@@ -44,17 +45,16 @@ class FadingOpacity(Strategy):
 
     rate: float = 0.005
     until: int = milestone(9_000)
-    steps: int = 1_350
+    most: int = 0
 
     def __post_init__(self) -> None:
         require_number("rate", self.rate, below=1)
-        require_whole("steps", self.steps, least=0)
+        require_whole("most", self.most, least=0)
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)
-        share = min(1.0, _FEW_VIEWS / max(1, n_views))
-        if self.steps:
-            share = min(share * min(1.0, self.until / self.steps), self.steps / max(1, self.until))
+        share = min(1.0, _FEW_VIEWS / max(1, n_views)) * min(1.0, self.until / _LONG_RUN)
+        share = min(share, self.most / max(1, self.until)) if self.most else share
         self.cache["rate"] = self.rate * share
         if share < 1:
             _log.debug("opacities fade by %.5f an iteration instead of %.5f (%d views, until t=%d).",

@@ -564,7 +564,7 @@ def test_a_loop_without_hr_is_told_of_no_work_on_it(factor, caplog):
 @pytest.mark.parametrize("activation", [torch.nn.functional.softplus, torch.sigmoid])
 def test_what_a_loop_computes_before_it_renders_is_of_what_strategies_have_left(activation):
     """A regularizer, or an activation: `after_step` comes with the step, not with the next rendering."""
-    host, clear, _ = started(FadingOpacity(rate=0.1, until=1_350))
+    host, clear, _ = started(FadingOpacity(rate=0.1))
     p, seen = host.splats, []
     for _ in range(3):
         opacities = activation(p["opacities"]).clamp(max=0.99)
@@ -586,7 +586,7 @@ def test_what_a_loop_computes_before_it_renders_is_of_what_strategies_have_left(
 @pytest.mark.parametrize("step", [0, 1])
 def test_parameters_that_are_frozen_before_a_step_stay_as_they_are(step):
     """Before the second, Adam's moments would move them on an extra view."""
-    host, clear, render = started(FadingOpacity(rate=0.1, until=1_350), GCO(), toy.ShowsDark())
+    host, clear, render = started(FadingOpacity(rate=0.1), GCO(), toy.ShowsDark())
     for i in range(step + 3):
         if i == step:
             before = {name: host.splats[name].detach().clone() for name in ("means", "opacities", "detail")}

@@ -24,13 +24,13 @@ def faded(settings, t=1, views=3, opacities=LOGITS):
 
 
 def test_every_opacity_loses_the_same_share_but_one_that_no_renderer_draws_so_that_logits_stay_finite():
-    params = faded(FadingOpacity(rate=0.02, until=1_350))
+    params = faded(FadingOpacity(rate=0.02))
     visible = LOGITS > -11.5
     expected = LOGITS.double().sigmoid() * 0.98
     assert torch.allclose(params["opacities"].double().sigmoid()[visible], expected[visible], rtol=1e-6)
     assert torch.equal(params["means"], torch.ones(len(LOGITS), 3))
     params = {"opacities": torch.tensor([-200.0, -11.6, 2.0])}
-    strategy = FadingOpacity(rate=0.5, until=1_350)
+    strategy = FadingOpacity(rate=0.5)
     strategy.on_fit_start(3, seed=0)
     for t in range(1, 1000):
         strategy.after_step(params, Step(t, SCENE.train[0], None, None))
@@ -39,17 +39,16 @@ def test_every_opacity_loses_the_same_share_but_one_that_no_renderer_draws_so_th
 
 
 @pytest.mark.parametrize(
-    ("views", "until", "rate"),
+    ("views", "until", "most", "rate"),
     [
-        (1, 1_350, 0.02), (3, 1_350, 0.02), (6, 1_350, 0.01), (12, 1_350, 0.005), (3, 270, 0.004),
-        (3, 2_700, 0.01), (6, 2_700, 0.01), (12, 2_700, 0.005), (3, 27_000, 0.001),
+        (1, 9_000, 0, 0.02), (3, 9_000, 0, 0.02), (6, 9_000, 0, 0.01), (12, 9_000, 0, 0.005), (3, 1_350, 0, 0.02),
+        (3, 270, 0, 0.004), (3, 1_350, 1_350, 0.02), (3, 270, 1_350, 0.004), (3, 2_700, 1_350, 0.01),
+        (6, 2_700, 1_350, 0.01), (12, 2_700, 1_350, 0.005), (3, 27_000, 1_350, 0.001),
     ],
 )  # fmt: skip
-def test_the_more_views_and_the_shorter_or_longer_the_run_the_slower_it_fades(views, until, rate):
-    lost = 1 - faded(FadingOpacity(rate=0.02, until=until), views=views)["opacities"][4].sigmoid() / 0.5
+def test_the_more_views_and_the_shorter_or_with_a_bound_the_longer_the_run_the_slower_it_fades(views, until, most, rate):
+    lost = 1 - faded(FadingOpacity(rate=0.02, until=until, most=most), views=views)["opacities"][4].sigmoid() / 0.5
     assert float(lost) == pytest.approx(rate, rel=1e-4)
-    lost = 1 - faded(FadingOpacity(rate=0.02, until=until, steps=0), views=views)["opacities"][4].sigmoid() / 0.5
-    assert float(lost) == pytest.approx(0.02 * min(1, 3 / views), rel=1e-4)
 
 
 def test_after_nine_tenths_of_the_run_and_without_a_rate_opacities_are_left_alone():
@@ -60,11 +59,10 @@ def test_after_nine_tenths_of_the_run_and_without_a_rate_opacities_are_left_alon
 
 
 def test_a_run_fades_and_every_row_has_the_bits_of_the_pass_that_skips_some():
-    faint = FadingOpacity(rate=0.05, until=1_350)
     states = {
         name: start(("gco", "svs"), more=more)
         for name, more in (
-            ("plain", ()), ("fading", (faint,)), ("every row", (replace(faint),)),
+            ("plain", ()), ("fading", (FadingOpacity(rate=0.05),)), ("every row", (FadingOpacity(rate=0.05),)),
         )
     }  # fmt: skip
     every_row = states["every row"]
