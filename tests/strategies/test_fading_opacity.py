@@ -46,7 +46,9 @@ def test_every_opacity_loses_the_same_share_but_one_that_no_renderer_draws_so_th
         (6, 2_700, 1_350, 0.01), (12, 2_700, 1_350, 0.005), (3, 27_000, 1_350, 0.001),
     ],
 )  # fmt: skip
-def test_the_more_views_and_the_shorter_or_with_a_bound_the_longer_the_run_the_slower_it_fades(views, until, most, rate):
+def test_the_more_views_and_the_shorter_or_with_a_bound_the_longer_the_run_the_slower_it_fades(
+    views, until, most, rate
+):
     lost = 1 - faded(FadingOpacity(rate=0.02, until=until, most=most), views=views)["opacities"][4].sigmoid() / 0.5
     assert float(lost) == pytest.approx(rate, rel=1e-4)
 
