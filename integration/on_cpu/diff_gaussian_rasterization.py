@@ -182,13 +182,20 @@ class GaussianRasterizer(torch.nn.Module):
         image, alpha = view.picture(parts, centres, None, absgrad)
         image = image.permute(2, 0, 1).contiguous()
         radii = _radii(drawn.visible, inputs, camera, kernel)
-        z = depths(means3D, pose.to(means3D))[:, None].clamp_min(_NEAR)
-        kinds = _unpacked() if s.antialiasing is s.kernel_size is None else ("inverse",) * (s.antialiasing is not None)
-        more = {
-            "depth": lambda: _sum(rasterizer, camera, inputs, z), "inverse": lambda: _sum(rasterizer, camera, inputs, 1 / z),
-            "alpha": lambda: alpha[None],
-        }  # fmt: skip
-        returned = image, radii, *(more[kind]() for kind in (_OF_FSGS if s.confidence is not None else kinds))
+        if s.confidence is not None:
+            kinds: Sequence[str] = _OF_FSGS
+        elif s.antialiasing is not None:
+            kinds = ("inverse",)
+        else:
+            kinds = _unpacked() if s.kernel_size is None else ()
+
+        def drawn_as(kind: str) -> Tensor:
+            if kind == "alpha":
+                return alpha[None]
+            z = depths(means3D, pose.to(means3D))[:, None].clamp_min(_NEAR)
+            return _sum(rasterizer, camera, inputs, 1 / z if kind == "inverse" else z)
+
+        returned = image, radii, *map(drawn_as, kinds)
         if UNPACKED and all(len(names) != len(returned) for names in UNPACKED):
             raise OwnRasterizerError(f"what it returns ({'; '.join(map(', '.join, sorted(UNPACKED)))})")
         return returned
