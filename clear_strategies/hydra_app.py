@@ -80,8 +80,9 @@ def main(overrides: Sequence[str] | None = None) -> None:
         raise sweep.worker_ended(error) from error
     except (KeyboardInterrupt, SystemExit) as end:
         if getattr(end, "code", None) != exit_codes.UNUSABLE:  # the sweep has not come to its end
-            for folder in map(shlex.quote, (f"hydra.sweep.dir={folder}" for folder in _begun)):
-                _log.info("Go on with the sweep by the same command with %s fit.resume=auto.", folder)
+            for folder in _begun:
+                setting = shlex.quote(f"hydra.sweep.dir={folder}")
+                _log.info("Go on with the sweep by the same command with %s fit.resume=auto.", setting)
         raise
 
 
