@@ -31,6 +31,7 @@ _log = logging.getLogger(__name__)
 _AT_LOWER_BOUND: Final = "omega_at_lower_bound"
 _SCALES: Final = CONFLICT_GROUPS.index("scales")
 _QUATS: Final = CONFLICT_GROUPS.index("quats")
+_OPACITIES: Final = CONFLICT_GROUPS.index("opacities")
 _TINY: Final = torch.finfo(torch.float64).tiny
 # A Gaussian whose axes are equally long does not change when it is rotated: in exact arithmetic its rotation gradient is 0, in
 # floating point it is noise that would "conflict" one time in five.
@@ -98,13 +99,16 @@ class GCO(Strategy):
         for group in set(CONFLICT_GROUPS).difference(self.groups):  # an index that is a list waits for the device
             below[:, CONFLICT_GROUPS.index(group)].zero_()
         evidence = None if step is None else step.evidence
+        keeps_length = self.keep_length and evidence is None
+        if keeps_length and not (self.whole or self.drop):
+            below[:, _OPACITIES].zero_()  # opposite numbers pass as they are, so the log leaves them out
         q = p.dot.new_zeros(1) if evidence is None else evidence.reliability.double()
         ω = times(below, ((1 - q) / (τ - 1))[:, None]).clamp_(self.weight_min, self.weight_max)  # s (1 - q), Eq. 11
         self._report(p, below, ω, evidence is not None)
         if self.drop:
             return Weights(keep=(below == 0).double())
         remove = per_norm.mul_(h2).mul_(below).mul_(ω)  # ω (c + τ_c) ‖h‖ / ‖l‖, Eq. 7
-        if evidence is not None or not self.keep_length:
+        if not keeps_length:
             return Weights(remove=remove)
         u = times(below, ω)  # ‖ĝ_HR‖² / ‖g_HR‖² = 1 + u² - 2 u c, where c = below - τ_c
         keep = times(u, u).addcmul_(u, below, value=-2).add_(u, alpha=2 * τ).add_(1).clamp_min_(_CANCELLED).rsqrt_()

