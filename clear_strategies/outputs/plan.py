@@ -96,7 +96,7 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[s
         "device": f"cuda, {torch.cuda.get_device_name(state.device)}" if on_cuda else state.device.type,
         **machine,
         "per-Gaussian pass": "readable" if state.compiled_step is None else "compiled",
-        "milestones": _listed(_marks(state)),
+        "milestones": _listed(_marks(state)) or "none",
     }
     if iterations := milestones(state.density.settings):
         lines[f"milestones of {state.density.name}"] = _listed(iterations)
@@ -142,7 +142,8 @@ def _skipped(state: TrainState) -> Iterator[str]:
 def _marks(state: TrainState) -> dict[str, int]:
     """The milestones of λ_HR and of the strategies, iterations by name."""
     hr = state.conductor.objective.lambda_hr
-    at = {"HR from": hr.start, "HR full": hr.full} | ({"HR decays": hr.decay_from} if hr.final != hr.peak else {})
+    at = {"HR from": hr.start, "HR full": hr.full} if hr.peak else {}
+    at |= {"HR decays": hr.decay_from} if hr.final != hr.peak else {}
     for s in state.conductor.strategies:
         at |= {f"{type(s).__name__} {name}": t for name, t in milestones(s).items()}
     return at

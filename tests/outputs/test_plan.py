@@ -69,6 +69,7 @@ def test_a_strategy_without_effect_is_warned_of(
         found = lines(started(GCO(), P2G(), lambda_hr=idle), "gco", "p2g")
         for name in ("GCO", "P2G"):
             assert f"{name} has no effect: lambda_HR is 0 throughout." in caplog.text
+    assert "HR from" not in found["milestones"]
     assert "HR scale until iteration 500 (lambda_HR = 0)" in found["skipped"]  # P2G's score needs it then
     assert "HR scale throughout (lambda_HR = 0)" in lines(started(GCO(), lambda_hr=idle), "gco")["skipped"]
     monkeypatch.setattr(type(state.density), "collects", lambda self, t: False)  # as MCMC, which reads no score
