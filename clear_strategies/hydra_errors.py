@@ -32,6 +32,9 @@ _IN_OUR_WORDS: Final = {
     r"^Multiple values for (\S+)\. To override a value use 'override \S+: (\S+)'$": (
         "+{0}={1}: a choice of this group is there already. Replace it: {0}={1}."
     ),
+    r"^Ambiguous value for argument '(.+?)=(.+)' 1\. ": (
+        "{0}: {1} is several values. -m trains a run with each, and brackets make them one list: '{0}=[{1}]'."
+    ),
 }
 _SWEEPS: Final = re.compile(r"\+?(experiment=|strategy=[^\[]*,)")  # overrides by which strategies come later
 
@@ -64,6 +67,8 @@ def no_option(group: str, name: object, listed: Sequence[str], config: str = "co
         groups = [other for other in groups if other in chosen]
     near = [f"{'' if other in chosen else '+'}{other}={name}" for other in groups]
     near += difflib.get_close_matches(str(name), listed, 1)
+    if set(several := re.split(r"[+ ]+", str(name))) <= {*listed}:  # as the title of a run has them
+        near = [f"'{'' if group in chosen else '+'}{group}=[{','.join(several)}]'"]
     suggestion = f" Did you mean {' or '.join(near)}?" if near else ""
     return f"{group}={name}: there is no such option.{suggestion} There are {', '.join(listed)}."
 
