@@ -54,7 +54,7 @@ MAPS: Final = {
     "demand": "demand A\nhow much detail is there to gain",
     "weight": "weight w = R·A\nhow much the SR image's detail counts",
     "conflict": "conflict\n1 where LR and HR gradients point apart",
-    "corrected": "corrected\nthe share of the HR gradient that was taken away",
+    "corrected": "corrected\nby what share the HR gradient was changed",
 }
 """Captions of the maps, by their names."""
 _COLUMNS: Final = 3  # of maps.jpg
@@ -148,7 +148,7 @@ def _write_picture(path: Path, view: View, found: ViewMaps) -> None:
         title = f"depth by stereo, {near:.3g} (bright) to {far:.3g} (dark) world units\nknown at {stereo.coverage:.0%}"
         tiles |= {title: (far - depth) / (far - near), "confidence of the depth": confidence}
     pixels = {name: image.detach().clamp(0, 1).cpu().numpy() for name, image in tiles.items()}
-    figures.write_tiles(path, pixels, f"{view.name}: how far the SR image is believed, from 0 (dark) to 1", _COLUMNS)
+    figures.write_tiles(path, pixels, f"{view.name}: photo, SR image and maps from 0 (dark) to 1", _COLUMNS)
 
 
 def _evidence(conductor: Conductor, view: View) -> tuple[Strategy, PatchMaps] | None:
