@@ -162,8 +162,10 @@ def _called(node: Mapping[str, Any], key: str) -> Any:
 
 def _place_in_module(error: Exception) -> str:
     """File and line of the module that raises while it is imported; empty where the module is not there."""
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if "importlib" not in frame.filename]
-    last = frames[-1]
+    passed_on = re.compile(
+        r"importlib|[/\\]dataclasses\.py$"
+    )  # dataclasses: what a decorator refuses is written below it
+    last = [frame for frame in traceback.extract_tb(error.__traceback__) if not passed_on.search(frame.filename)][-1]
     return "" if last.filename == __file__ else f"{last.filename}:{last.lineno}"
 
 
@@ -286,7 +288,9 @@ def _of_type(value: Any, hint: Any, key: str) -> Any:
         except BeartypeException:  # a hint that beartype does not support
             return value
     shown = repr(value) if isinstance(value, str | int | float | list | Mapping | None) else f"a {type(value).__name__}"
-    raise SettingError(f"{key}: must be {_in_words(hint)}, got {shown}.")
+    parts = [_joined(key, f.name) for f in fields(hint) if f.init] if is_dataclass(hint) else []
+    remedy = f" Set {', '.join(parts)}." if parts else ""
+    raise SettingError(f"{key}: must be {_in_words(hint)}, got {shown}.{remedy}")
 
 
 def _is_of(value: Any, hint: Any) -> bool:

@@ -80,7 +80,7 @@ REFUSED = {
     "share: is needed and missing. Add +it.share=….": {},
     "shape: tests.test_settings.Outer has no such setting. Did you mean it.share?": {"share": 1, "shape": 1},
     "zzz: tests.test_settings.Outer has no such setting. There is share, inner": {"share": 1, "zzz": 1},
-    "inner: must be a Inner, got 3": {"share": 1, "inner": 3},
+    "inner: must be a Inner, got 3. Set it.inner.size, it.inner.mode": {"share": 1, "inner": 3},
     "inner.size: must be a whole number, got 2.5": {"share": 1, "inner": target(Inner, size=2.5)},
     "inner.size: must be a whole number, got 2.0": {"share": 1, "inner": target(Inner, size=2.0)},
     "inner.mode: must be a or b or 1, got 'c'": {"share": 1, "inner": target(Inner, mode="c")},
@@ -126,3 +126,12 @@ def test_every_entry_of_a_list_is_checked_and_random_numbers_of_the_program_stay
             build(target(Outer, share=1, names=["a", "b", "c", 1]))
         assert build(target(Outer, share=1, names=["a", "b"])).names == ["a", "b"]
         assert random.getstate() == state
+
+
+def test_what_a_decorator_refuses_is_named_by_the_file_of_the_class(tmp_path, monkeypatch):
+    (tmp_path / "of_her_own.py").write_text(
+        "from dataclasses import dataclass\n@dataclass\nclass Mine:\n    a: list = []\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(SettingError, match=r"of_her_own\.py:2: ValueError: mutable default .* Correct that file"):
+        build({TARGET: "of_her_own.Mine"}, "it")
