@@ -139,7 +139,7 @@ def _remedy(key: str, value: str, overrides: Sequence[str], known: Mapping[str, 
             "Hydra composes a sweep first without what is swept, here the strategies. Sweep this setting, too "
             f"({key}=a,b), or name the strategies that remain (+strategy=[gco,svs])."
         )
-    elif not beside and parent.removeprefix("strategies.") in options("strategy"):
+    elif not beside and parent in {f"strategies.{option}" for option in options("strategy")}:
         remedy = f"Its strategy is not in this run: +strategy={parent.removeprefix('strategies.')}."
     elif name == TARGET:  # of a strategy or a decorator that is new
         remedy = f"A plus adds it: +{key}=…."

@@ -23,7 +23,7 @@ from clear_strategies.core.gradients import Grads, ScreenGradients, Shot
 from clear_strategies.core.step import Losses, Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.core.work_log import WorkLog
-from clear_strategies.errors import AnswerError, StrategyConflict
+from clear_strategies.errors import AnswerError, SettingError, StrategyConflict
 from clear_strategies.merging.logs import IterationLogs
 from clear_strategies.merging.objective import Objective
 from clear_strategies.strategies.answers import (
@@ -72,10 +72,16 @@ class Hooks:
         work_log: which work was done, and which was skipped.
 
     Raises:
+        SettingError: what is given is no strategy.
         StrategyConflict: two strategies answer a question that only one may.
     """
 
     def __init__(self, strategies: Sequence[Strategy], objective: Objective) -> None:
+        for given in strategies:
+            if not isinstance(given, Strategy):
+                raise SettingError(
+                    f"a conductor takes strategies one by one, as Conductor(GCO(), P2G()), got {given!r:.80}."
+                )
         self.strategies = tuple(strategies)
         self.objective = objective
         self.views: tuple[View, ...] = ()

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core.checks import require_choice, require_number, require_whole
+from clear_strategies.core.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
 from clear_strategies.core.points import spread
 from clear_strategies.core.seeds import dropout_mask
@@ -63,6 +63,8 @@ class SVS(Strategy):
     shared: bool = True
 
     def __post_init__(self) -> None:
+        if not isinstance(self.dropout, Ramp):  # as a number, from Python
+            refuse("dropout", "must be a Ramp", self.dropout, "dropout=Ramp(0.2)")
         require_whole("looks", self.looks, least=0)
         require_number("anchor_strength", self.anchor_strength)
         require_choice("reduction", self.reduction, ("sum", "mean"))
