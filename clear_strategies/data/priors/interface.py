@@ -4,9 +4,11 @@ and functions that priors share.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import logging
 import os
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -101,7 +103,10 @@ def layers(prior: object) -> Iterator[object]:
 
 def cache_folder() -> Path:
     """The folder of all caches: $CLEAR_CACHE, else ~/.cache/clear-strategies."""
-    return Path(os.environ.get("CLEAR_CACHE") or Path.home() / ".cache" / "clear-strategies").expanduser()
+    try:
+        return Path(os.environ.get("CLEAR_CACHE") or "~/.cache/clear-strategies").expanduser()
+    except RuntimeError:  # no $HOME, and a user without an account, as in a container
+        return Path(tempfile.gettempdir(), "clear-strategies")
 
 
 def cached(prior: Prior) -> Prior:
@@ -138,7 +143,9 @@ class Cached:
         try:
             write_png(file, result)
         except OSError as error:  # without the cache the run is slower, not wrong
-            _log.warning("the SR image of %s cannot be cached in %s (%s).", name, self.folder, error.strerror)
+            _warn_once(
+                f"SR images cannot be cached in {self.folder} ({error.strerror}). $CLEAR_CACHE names another folder."
+            )
         return result
 
     def _key(self, lr: Float[Tensor, "h w 3"], factor: int) -> str:
@@ -150,6 +157,11 @@ class Cached:
         for file in self.prior.files:
             digest.update(hashlib.sha256(read_bytes(file, remedy="set prior.path to the model")).digest())
         return digest.hexdigest()
+
+
+@functools.cache
+def _warn_once(message: str) -> None:
+    _log.warning(message)
 
 
 def fingerprint(network: Network) -> str:
