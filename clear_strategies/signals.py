@@ -25,7 +25,7 @@ class Interrupted(ClearError):
 
     def __init__(self, signum: int, when: str, saved: Path | None) -> None:
         self.signum, self.exit_code = signum, 128 + signum
-        where = f"Go on with fit.resume={saved}" if saved else "Nothing was saved"
+        where = f"Go on by the same command with fit.resume={saved}" if saved else "Nothing was saved"
         super().__init__(f"stopped by {signal.Signals(signum).name} {when}. {where}.")
 
 

@@ -57,7 +57,10 @@ def test_a_signal_that_ends_a_run_saves_before(signals, tmp_path):
     said = tmp_path / "said"
     ended = started("-c", stopped_by(*signals, after=5), *SAVING, cwd=tmp_path, said=said).wait()
     assert ended == 128 + signals[0], said.read_text()
-    assert f"Go on with fit.resume={tmp_path}/cut/checkpoints/step_0000006.safetensors." in said.read_text()
+    assert (
+        f"Go on by the same command with fit.resume={tmp_path}/cut/checkpoints/step_0000006.safetensors."
+        in said.read_text()
+    )
     assert len(list((tmp_path / "cut/checkpoints").iterdir())) == 1
 
 
@@ -81,7 +84,8 @@ def test_a_terminal_that_is_closed_takes_nothing_of_a_run_with_it(tmp_path):
     process = started("-c", code + closing, *SAVING, cwd=tmp_path, said=tmp_path / "said")
     log = tmp_path / "cut/run.log"
     assert process.wait() == 128 + signal.SIGHUP, log.read_text()
-    assert f"stopped by SIGHUP before iteration 6. Go on with fit.resume={tmp_path}/cut/checkpoints/" in log.read_text()
+    go_on = f"Go on by the same command with fit.resume={tmp_path}/cut/checkpoints/"
+    assert f"stopped by SIGHUP before iteration 6. {go_on}" in log.read_text()
 
 
 @pytest.mark.slow

@@ -86,7 +86,10 @@ def test_ctrl_c_after_training_names_the_checkpoint_that_was_saved(tmp_path: Pat
         job.run(composed(*TINY, "+strategy=gco", "prior=bicubic", "fit.threads=1", "fit.iterations=3"), tmp_path)
     saved = tmp_path / "checkpoints" / "step_0000004.safetensors"
     assert saved.is_file()
-    assert str(told.value) == f"stopped by SIGINT before the run was finished. Go on with fit.resume={saved}."
+    assert (
+        str(told.value)
+        == f"stopped by SIGINT before the run was finished. Go on by the same command with fit.resume={saved}."
+    )
 
 
 def test_a_setting_of_density_has_no_effect_beside_a_strategy_that_densifies(tmp_path: Path, caplog):

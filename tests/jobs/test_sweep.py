@@ -293,7 +293,8 @@ def test_a_stopped_joblib_sweep_saves_its_running_jobs_begins_no_other_and_leave
     process.send_signal(stop)
     assert process.wait() == 128 + stop, (tmp_path / "said").read_text()
     for folder in running:
-        told = rf"stopped by {stop.name} before iteration (\d+)\. Go on with fit\.resume=\S+/step_0*\1\.safetensors\."
+        go_on = r"Go on by the same command with fit\.resume=\S+/step_0*\1\.safetensors\."
+        told = rf"stopped by {stop.name} before iteration (\d+)\. {go_on}"
         assert re.search(told, (folder / "run.log").read_text())
     assert not (tmp_path / "all" / "2").exists()
 
