@@ -1,5 +1,6 @@
 """`stereo`: the trainer's cloud from plain tensors, in the light core too, and refusals that say what to give instead."""
 
+import re
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -67,7 +68,10 @@ def test_means_lie_on_the_plane_and_the_summary_says_how_much_is_known(plane: St
     assert plane.colors.max() <= 1
     shares = ", ".join(f"{depth.coverage:.0%}" for depth in plane.depths)
     assert plane.summary.startswith(f"{len(plane.means):,} points in all: ")
-    assert f"between the 3 photos (depth known at {shares}), filled by " in plane.summary
+    assert f"between the 3 photos (depth known at {shares}), less " in plane.summary
+    counts = re.findall(r"([\d,]+) (?:points|outliers|at completed)", plane.summary)
+    total, found, outliers, added = (int(count.replace(",", "")) for count in counts)
+    assert total == found - outliers + added
     assert "without" not in plane.summary
 
 
