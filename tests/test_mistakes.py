@@ -92,3 +92,20 @@ def test_a_mistake_is_told_with_its_remedy(row: dict[str, str], folder: Path) ->
     assert {path for path in folder.iterdir() if path.name not in ("outputs", "cache")} == before
     assert not list(folder.rglob("metrics.json"))
     assert not list(folder.rglob("*.tmp"))
+
+
+PYTHON = """
+from clear_strategies import GCO, SVS, Conductor
+from clear_strategies.errors import SettingError
+for call in "Conductor('gco')", "Conductor([GCO()])", "Conductor(GCO)", "SVS(dropout=0.2)":
+    try:
+        eval(call)
+    except SettingError as error:
+        print(error)
+"""
+
+
+def test_from_python_what_is_of_another_type_is_refused_where_it_is_given(tmp_path: Path) -> None:
+    said = command_line.run(cwd=tmp_path, code=PYTHON).stdout  # a process without the tests' type checker
+    assert said.count("takes strategies one by one") == 3
+    assert "dropout: must be a Ramp, got 0.2: dropout=Ramp(0.2)" in said

@@ -29,7 +29,7 @@ from clear_strategies import (
 )  # fmt: skip
 from clear_strategies.core.seeds import dropout_mask
 from clear_strategies.data.priors import BackProjected, Bicubic
-from clear_strategies.errors import AnswerError, SettingError
+from clear_strategies.errors import AnswerError
 from clear_strategies.kernels.losses import reference
 from clear_strategies.merging.logs import computed
 from clear_strategies.schedules import WarmupDecay
@@ -711,9 +711,6 @@ def test_one_route_for_all_gaussians_is_that_of_each(drawn):
 
 
 def test_two_owners_of_one_question_are_refused_and_the_order_does_not_matter(drawn):
-    for given_instead in ("gco", [GCO()], GCO):
-        with pytest.raises(SettingError, match="takes strategies one by one"):
-            Conductor(given_instead)
     with pytest.raises(StrategyConflict, match=r"GCO and Halve both implement reconcile\(\) or correct\(\)"):
         Conductor(GCO(), Halve())
     one, other = (updated(drawn, *s).grads for s in ((GCO(), P2G(), SVS()), (SVS(), P2G(), GCO())))

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from clear_strategies import SVS, AnchorError, Conductor
 from clear_strategies.core.seeds import dropout_mask, generator_at, hashed_generator_at
-from clear_strategies.errors import SettingError
 from clear_strategies.schedules import Ramp
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
@@ -146,11 +145,6 @@ def test_densification_ends_when_the_anchor_is_taken_once_whatever_a_skip_jumped
     without = started(anchor_start=5, anchor_strength=0.0)
     without.after_step(at_seven, toy.step(7))
     assert not without.state
-
-
-def test_a_rate_that_is_a_number_is_refused():
-    with pytest.raises(SettingError, match=r"dropout: must be a Ramp, got 0\.2: dropout=Ramp\(0\.2\)"):
-        SVS(dropout=0.2)
 
 
 def test_a_changed_number_of_gaussians_under_an_anchor_is_an_error():
