@@ -273,7 +273,7 @@ class Strategy:
     def log(self, name: str, value: Logged) -> None:
         """Log a scalar of this iteration, or a function that computes it, which is called before the next iteration if at all: a
         host calls it in every hundredth. A 0-dim tensor on a device is read later, see `core.deferred`. If another strategy has
-        logged the same name, the column is "<class>.<name>". Without a conductor, read `logs`: GCO's `logs["corrected"]()`.
+        logged the same name, the column is "<class>.<name>". Without a conductor, `merging.logs.computed(self.logs)` has them.
         """
         is_number = value.dim() == 0 if isinstance(value, Tensor) else isinstance(value, (Real, Deferred))
         if not (is_number or callable(value)):
