@@ -150,11 +150,11 @@ class SheetRow:
     compared: Collection[str] = ()
     truth: str | None = None
 
-    def part(self) -> tuple[slice, slice] | None:
-        """The part that is outlined and shown below."""
+    def part(self, times: float) -> tuple[slice, slice] | None:
+        """The part that is outlined and shown below, see `window`."""
         if not self.compared:
             return None
-        return window([self.images[name] for name in self.compared], self.images.get(self.truth or ""))
+        return window([self.images[name] for name in self.compared], self.images.get(self.truth or ""), times)
 
 
 def magnification(height: int, width: int) -> float:
@@ -164,16 +164,21 @@ def magnification(height: int, width: int) -> float:
     return max(1, min(math.ceil(_NARROW / width), _TALL // height))
 
 
-def window(images: Sequence[np.ndarray], truth: np.ndarray | None = None) -> tuple[slice, slice]:
+def window(
+    images: Sequence[np.ndarray], truth: np.ndarray | None = None, times: float | None = None
+) -> tuple[slice, slice]:
     """Find the part [rows, columns] of RGB images [H, W, 3] where they differ most; the central one if all are equal. With the
     truth, it is where the sum of errors varies most between images, which noise in all of them does not affect.
 
     For images that a sheet reduces, the part has the size at which they are shown, and is at most square.
+
+    Args:
+        times: the magnification of the sheet, whose other images may be larger; None: of these images.
     """
     several = np.stack(images)
     apart = several.std(axis=0).mean(axis=-1)
     errors = None if truth is None else np.abs(several - truth).mean(axis=-1)
-    times = magnification(*apart.shape)
+    times = magnification(*apart.shape) if times is None else times
     h, w = (max(1, round(size * times) if times < 1 else size // _ENLARGED) for size in apart.shape)
     h = min(h, w) if times < 1 else h
     tops, lefts = (range(0, size - part + 1, max(1, part // 4)) for size, part in zip(apart.shape, (h, w), strict=True))
@@ -233,7 +238,7 @@ def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: 
     h, w = (max(image.shape[axis] for row in rows for image in row.images.values()) for axis in (0, 1))
     times = magnification(h, w)
     cell_h, cell_w = round(times * h), round(times * w)
-    parts = [row.part() for row in rows]
+    parts = [row.part(times) for row in rows]
     zoom = 1 if times < 1 else int(times) * _ENLARGED  # of the parts
     below = [0 if part is None else zoom * (part[0].stop - part[0].start) + _GAP for part in parts]  # their heights
     larger = max(1.0, max(len(columns) * cell_w, len(rows) * cell_h + sum(below)) / _SCREEN)

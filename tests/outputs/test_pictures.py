@@ -92,6 +92,15 @@ def test_of_an_image_that_is_reduced_a_part_is_shown_at_its_own_pixels_and_uprig
     assert magnification(1160, 776) * 1160 == pytest.approx(384)
 
 
+def test_parts_of_photos_of_both_orientations_do_not_cover_each_other(tmp_path: Path) -> None:
+    shown = [{name: array(k, *size) for k, name in enumerate(("ours", "truth"))} for size in ((612, 816), (816, 612))]
+    write_contact_sheet(tmp_path / "sheet.png", [SheetRow("a", images, compared=images) for images in shown], "mixed")
+    sheet = read(tmp_path / "sheet.png")
+    for images in shown:
+        part = window([*images.values()], times=magnification(816, 816))
+        assert all(holds(sheet, image[part], times=1) for image in images.values())
+
+
 def test_every_caption_and_the_small_print_are_on_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     words: list[str] = []
     monkeypatch.setattr(Figure, "text", lambda page, x, y, text, **style: words.append(text))
