@@ -170,7 +170,7 @@ class HostMerge:
         g_lr, out = done.added(names, scale)
         if not out:  # all Gaussians are frozen
             return {}
-        params = {name: done.params[name].detach() for name in out}
+        params = {name: p.detach() for name, p in done.params.items()}  # frozen ones, too, which strategies read
         high = Grads({name: widened(g) for name, g in g_hr.items()}, colour=g_hr.colour)
         merged = self.replayed(params, g_lr, high, step, t, out)
         if self._host.loss_scale is None and not isinstance(merged.finite, Tensor) and not merged.finite:

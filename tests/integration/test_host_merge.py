@@ -7,7 +7,7 @@ from importlib import import_module
 import pytest
 import torch
 
-from clear_strategies import GCO, SVS, Conductor, Evidence, Grads, Objective, Weights
+from clear_strategies import GCO, SVS, Conductor, Evidence, Grads, Objective, Strategy, Weights
 from clear_strategies.core import deferred
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Colour
 from clear_strategies.errors import DivergedError
@@ -334,3 +334,22 @@ def test_dense_gradients_are_the_factors_product():
     assert set(g) == set(like)
     assert torch.equal(g["shN"][:, :8], colour.basis[:, 1:, None] * colour.rgb[:, None])
     assert not g["shN"][:, 8:].any()
+
+
+class PulledByTheMeans(Strategy):
+    """Adds a gradient of one parameter that follows from another."""
+
+    def regularize(self, params, t):
+        return {"scales": params["means"]}
+
+
+def test_a_strategy_reads_parameters_that_the_loop_has_frozen():
+    def gradients(*strategies):
+        host, _, render = gsplat_host.started(*strategies)
+        host.splats["means"].requires_grad_(False)
+        render().mean().backward()
+        return host.splats
+
+    alone, pulled = gradients(), gradients(PulledByTheMeans())
+    assert pulled["means"].grad is None
+    torch.testing.assert_close(pulled["scales"].grad, alone["scales"].grad + pulled["means"])
