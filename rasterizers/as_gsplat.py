@@ -200,6 +200,7 @@ def cameras_of(viewmats: Float[Tensor, "C 4 4"], Ks: Float[Tensor, "C 3 3"], wid
 
 
 @functools.lru_cache(maxsize=1024)
+@torch.inference_mode(False)  # or the camera of an evaluation could not be trained by
 def _camera(
     pose: tuple[tuple[float, ...], ...], dtype: torch.dtype, fx: float, cx: float, fy: float, cy: float, width: int, height: int
 ) -> Camera:  # fmt: skip

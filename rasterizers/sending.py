@@ -17,6 +17,7 @@ def sent(numbers: Tensor, device: torch.device) -> Tensor:
 
 
 @lru_cache(maxsize=64)
+@torch.inference_mode(False)
 def color_on(color: Color, device: torch.device, dtype: torch.dtype = torch.float32) -> Float[Tensor, "1 3"]:
     """A colour on the device. Its memory is shared: it must not be changed in place."""
     return sent(torch.tensor([color], dtype=dtype, device="cpu"), device)

@@ -11,6 +11,7 @@ import rasterizers
 from rasterizers import Camera, as_gsplat, rasterization
 from rasterizers.geometry import spherical_harmonics
 from rasterizers.reference.projection import footprints
+from rasterizers.sending import color_on
 from tests.helpers.backends import needs
 
 WIDTH, HEIGHT, N, CAMERAS = 20, 14, 24, 2
@@ -174,6 +175,20 @@ def test_in_float32_values_and_gradients_are_those_of_float64(backend):
     require_close((image, alpha), exact, 1e-4, ("image", "alpha"))
     exact_gradients = gradients(*exact, {**splats, "colors": colors})
     require_close(gradients(image, alpha, inputs), exact_gradients, 1e-3, inputs)
+
+
+def test_a_camera_and_a_background_of_an_evaluation_can_be_trained_by():
+    splats, colors, (viewmats, Ks) = gaussians(), colours(False, 3), cameras()
+    viewmats, colour = viewmats.detach().clone(), (0.125, 0.25, 0.5)
+    viewmats[:, :3, 3] += 0.0123  # which no other test has
+
+    def image():
+        behind = color_on(colour, viewmats.device, viewmats.dtype).expand(len(viewmats), 3)
+        return drawn(splats, colors, viewmats, Ks, backgrounds=behind, backend="torch", sh_degree=3)[0]
+
+    with torch.inference_mode():
+        image()
+    image().sum().backward()
 
 
 ABSOLUTE = [*BACKENDS, pytest.param("warp", marks=needs("warp"), id="warp")]
