@@ -181,6 +181,7 @@ class Attached:
             if view is None:  # evaluation, a viewer, a camera without a photo
                 return rasterization(**self._with_detail(call, is_ours=is_ours, trained=False))
             calls.require_photo(call, view, len(self._params[self._names["means"]]))
+            call = calls.of_one_camera(call)
             if self._named is None:
                 calls.require_own_intrinsics(read()["Ks"], view)
             calls.require_pinhole(call, self.attachment.conductor.showing)

@@ -97,6 +97,12 @@ def require_photo(call: Call, view: View, n: int) -> None:
         )
 
 
+def of_one_camera(call: Call) -> dict[str, Any]:
+    """The call of one camera with its colours by Gaussian, [N, …], also if they are given by camera, [1, N, …]."""
+    colors, by_gaussian = call["colors"], 2 if call.get("sh_degree") is None else 3
+    return {**call, "colors": colors if colors.dim() == by_gaussian else colors[0]}
+
+
 def require_own_intrinsics(Ks: Float[Tensor, "*C 3 3"], view: View) -> None:
     """Raise a HostError if K of a call, in the CPU's memory, is not that of the view's photo."""
     (fx, _, cx), (_, fy, cy), _ = Ks.reshape(3, 3).tolist()

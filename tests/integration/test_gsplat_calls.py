@@ -21,8 +21,8 @@ from rasterizers.geometry import SH_C0
 from tests.helpers import gsplat_host, toy
 from tests.helpers.backends import needs
 from tests.helpers.gsplat_host import Host, started
-from tests.helpers.host_parts import HR_FROM_START, WITHOUT_HR
-from tests.helpers.loops import FUNCTIONS
+from tests.helpers.host_parts import HR_FROM_START, WITHOUT_HR, photometric
+from tests.helpers.loops import FUNCTIONS, Loop, Running, scene
 from tests.training.test_replayed_iteration import cropped
 
 
@@ -55,6 +55,27 @@ def test_a_depth_pass_is_part_of_its_step_and_colours_without_spherical_harmonic
     with torch.no_grad():
         image = features(host.rasterization, host, colors)
         assert torch.equal(image, features(gsplat_host.rasterization, host, colors + host.splats["detail"]))
+
+
+@pytest.mark.parametrize("degree", [3, None])
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_the_colours_of_the_only_camera_have_the_gradients_of_those_by_gaussian(function, degree):
+    def gradients(form):
+        running = Running(Loop(function=function))
+        p = running.splats
+        colors = torch.cat((p["sh0"], p["shN"]), 1) if degree else 0.5 + p["sh0"][:, 0]
+        c, photo = (photo := scene().train[0].lr).camera, photo.image
+        view = c.world_to_camera[None], intrinsics(c)[None], c.width, c.height
+        activated = p["scales"].exp(), p["opacities"].sigmoid(), form(colors)
+        photometric(
+            running.function(p["means"], p["quats"], *activated, *view, sh_degree=degree)[0][0], photo
+        ).backward()
+        return {name: x.grad for name, x in p.items() if x.grad is not None}
+
+    found, expected = gradients(lambda colors: colors[None]), gradients(lambda colors: colors)
+    assert found.keys() == expected.keys()
+    for name, g in expected.items():
+        torch.testing.assert_close(found[name], g, rtol=1e-3, atol=1e-9, msg=name)
 
 
 def test_a_photo_of_a_part_of_the_gaussians_is_refused():
