@@ -33,7 +33,7 @@ from integration.autograd_shot import (
     to_leaves,
 )
 from integration.densification import ScoreScaler, score_for_host
-from integration.graph import Graph, graph_of, require_apart, require_in_order, without_hooks
+from integration.graph import Graph, edge_of, graph_of, require_apart, require_in_order, without_hooks
 from integration.host import require_leaves
 from integration.views import SAME_POSE, require_intrinsics
 from rasterizers.interface import Camera
@@ -79,6 +79,7 @@ def joint_loss(
     require_leaves(params)
     _require_shots(params, lr=lr, hr=hr)
     of_lr, of_hr = graph_of(lr.image), graph_of(*(() if hr is None or hr.image.is_leaf else [hr.image]))
+    _require_centres(lr=(lr, of_lr), hr=(hr, of_hr))
     _require_detail(params.get("detail"), of_lr, of_hr)
     _require_view(conductor, view, lr=of_lr, hr=of_hr)
     _require_started(conductor)
@@ -158,6 +159,18 @@ def _require_rows(params: Mapping[str, Tensor]) -> None:
             )
 
 
+def _require_centres(**drawn: tuple[Shot | None, Graph]) -> None:
+    """Raise a HostError if an image is not computed from the tensor that should get its screen gradient, which would be 0."""
+    for name, (shot, graph) in drawn.items():
+        centres = shot.gradient_slot.tensor if isinstance(shot, AutogradShot) else None
+        if centres is None or not centres.requires_grad or not graph.nodes or edge_of(centres).node in graph.nodes:
+            continue
+        raise HostError(
+            f"{name} is not computed from its means2d {[*centres.shape]}, which would get no screen gradient. Pass what the "
+            "rasterizer returned, no part or copy of it: of gsplat's, slot=ScreenGradientSlot(info['means2d'], (width, height))."
+        )
+
+
 def _require_detail(detail: Tensor | None, lr: Graph, hr: Graph) -> None:
     if detail is None or not detail.requires_grad:
         return
@@ -208,7 +221,7 @@ class _HrShot:
     """
 
     def __init__(self, shot: AutogradShot, warn: Callable[..., None]) -> None:
-        require_apart(shot.drawn or {})
+        require_apart(shot.drawn or {}, len(shot.visible))
         shot = at_inputs(shot, warn)
         require_in_order("hr", shot.inputs, shot.params)
         self.image, self.means2d, self.visible, self._shot = shot.image, shot.means2d, shot.visible, shot

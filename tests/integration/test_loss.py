@@ -433,6 +433,18 @@ def test_f_det_at_lr_or_not_at_hr_and_a_strategy_that_has_not_started_are_refuse
     assert host.params["detail"].grad is None
 
 
+def test_a_part_of_the_centres_and_colours_by_camera_are_refused_by_name():
+    """As of gsplat's `info`: the screen gradient would be 0, and routing would take each camera for a Gaussian."""
+    host, conductor, view, lr, hr = drawn(P2G(patch=4))
+    conductor.on_fit_start(3, 0)
+    with pytest.raises(HostError, match=r"lr is not computed from its means2d \[20, 2\], .* slot=ScreenGradientSlot\("):
+        joint_loss(conductor, host.params, replace(lr, means2d=lr.means2d[:]), hr, view, 5)
+    named = host.activated(colors=torch.cat((host.params["sh0"], host.params["shN"]), 1)[None])
+    hr = replace(hr, drawn={name: named[name] for name in ("means", "colors")})
+    with pytest.raises(HostError, match=r"colors of drawn must have a row for each of the 20 Gaussians, got \[1, 20, "):
+        joint_loss(conductor, host.params, lr, hr, view, 5)
+
+
 def test_a_parameter_of_another_name_is_summed():
     host, conductor, view, *_ = drawn(GCO())
     tint = host.params["tint"] = torch.zeros(20, 3, requires_grad=True)
