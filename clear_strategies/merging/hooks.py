@@ -206,7 +206,7 @@ class Hooks:
         if not is_real(score, (n,)):
             refuse(s, "score", f"a tensor [{n}] or None", score)
         require_finite(s, "score", {"S": score})  # a Gaussian whose score is NaN would never grow
-        return score
+        return score.to(screen.ordinary.dtype)  # kernels read nothing else
 
     def answers(
         self, products: Products | None, both: Callable[[], tuple[Grads, Grads]], params: Mapping[str, Tensor],

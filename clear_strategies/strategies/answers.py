@@ -78,7 +78,7 @@ def is_real(x: Any, *shapes: tuple[int, ...]) -> bool:
 def rows_like(
     s: Strategy, hook: str, answer: Any, like: Mapping[str, Tensor], whose: str, *, finite: bool = False
 ) -> Grads:  # fmt: skip
-    """A gradient by attributes of `like`.
+    """A gradient by attributes of `like`, in their types: kernels would read the memory of whole numbers as floats.
 
     Args:
         whose: these attributes, as in "of g_HR". finite: check also that its numbers are finite.
@@ -92,7 +92,7 @@ def rows_like(
             refuse(s, hook, f"{name} as a tensor {[*like[name].shape]}", x)
     if finite:
         require_finite(s, hook, answer)
-    return Grads(answer)
+    return Grads({name: x.to(like[name].dtype) for name, x in answer.items()})
 
 
 def _named(s: Strategy, hook: str) -> str:

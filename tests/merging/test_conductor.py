@@ -543,6 +543,34 @@ def drawn():
     return field, view, *field.render_scales(toy.RASTERIZER, view)
 
 
+@pytest.mark.parametrize("dtype", [torch.bool, torch.int32, torch.float64])
+@pytest.mark.parametrize("hook", ["correct", "regularize", "score"])
+def test_an_answer_of_another_type_counts_as_its_numbers(hook, dtype):
+    """A kernel of float32 would read other memory than that of the answer."""
+    field, view = field_and_view(torch.float32)
+    of_float32 = field, view, *field.render_scales(toy.RASTERIZER, view)
+
+    def positive(form):
+        def each(gradients):
+            return {name: form(g > 0) for name, g in gradients.items()}
+
+        answers = {
+            "correct": lambda lr, hr, step: each(hr), "regularize": lambda params, t: each(params),
+            "score": lambda step, screen: form(screen.ordinary > screen.ordinary.median()),
+        }  # fmt: skip
+        return updated(of_float32, answering(hook, answers[hook])())
+
+    found, expected = positive(lambda x: x.to(dtype)), positive(Tensor.float)
+    assert not [name for name, g in expected.grads.items() if not torch.equal(found.grads[name], g)]
+    assert found.score.dtype == torch.float32
+    assert torch.equal(found.score, expected.score)
+
+
+def test_a_comparison_that_leaves_out_a_loss_keeps_its_value(drawn):
+    made = answering("compare", lambda scale, image, photo, step, losses: losses(image)._replace(values={"mine": 1.0}))
+    assert updated(drawn, made()).losses.keys() == {"lr", "base", "hf", "mine"}
+
+
 def test_a_shot_of_ones_own_need_not_sum(drawn):
     field, view, lr, hr = drawn
     mine = type("Mine", (SimpleNamespace,), {"vjp": lambda self, cotangents: hr.vjp(cotangents)})
