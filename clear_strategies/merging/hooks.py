@@ -292,13 +292,18 @@ class Hooks:
         """After the optimizer steps of an iteration."""
         params = MappingProxyType(params)  # to replace an entry would have no effect
         for s in self.strategies:
+            asked = params if overrides(s, "after_step") else {}
+            before = {name: _memory(p) for name, p in asked.items()}
             s.after_step(params, step)
+            if moved := [name for name, p in asked.items() if _memory(p) != before[name]]:
+                way = f"{moved[0]} in place, by {moved[0]}.copy_(…), {moved[0]} += … or {moved[0]}[…] = …"
+                raise AnswerError(f"{type(s).__name__}.after_step() must change {way}; other memory changes nothing.")
             require_stored(s, params)
 
     def may_densify(self, t: int) -> bool:
         for s in self.strategies:
             answer: Any = s.may_densify(t)
-            if answer is None:  # a forgotten return would end densification
+            if answer not in (True, False):  # a forgotten return would end densification
                 refuse(s, "may_densify", "True or False", answer)
             if not answer:
                 return False
@@ -383,7 +388,12 @@ def _compared(
     if not is_real(found.cotangents, tuple(shape)):
         rule = f"Losses whose cotangents are a tensor {[*shape]}; add a loss to one of them"
         refuse(s, "compare", rule, found.cotangents)
-    return found
+    return found._replace(values={**inner[0].values, **found.values})
+
+
+def _memory(p: Tensor) -> tuple[int, torch.Size]:
+    """Where a tensor lies, and its shape."""
+    return p.data_ptr(), p.shape
 
 
 def _extra_views(s: Strategy, t: int) -> list[ExtraView]:

@@ -111,11 +111,7 @@ def check_answers_have_their_shapes(make: Make) -> None:
         deferred.read([*computed(conductor.logs.scalars()).values()])
         without_error("draw", f"at t={t}", conductor.draw, t, params["means"], given.enlarged)
         conductor.extra_views(t)
-        memory = {name: p.data_ptr() for name, p in params.items()}
         conductor.after_step(params, update.step)
-        for name, p in params.items():
-            rule = f"after_step() must change {name} in place, by {name}.copy_(…), {name} += … or {name}[…] = …"
-            require(p.data_ptr() == memory[name], f"{rule}; its .data was assigned, which changes nothing")
 
 
 def check_works_without_hr(make: Make) -> None:

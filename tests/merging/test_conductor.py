@@ -260,6 +260,15 @@ def test_a_colour_may_be_a_list_and_a_forgotten_answer_does_not_end_densificatio
     assert Conductor(answering("background", [0.25, 0.5, 0])()).background(1) == (0.25, 0.5, 0)
     with pytest.raises(AnswerError, match=r"may_densify\(\) must give True or False, got None"):
         Conductor(answering("may_densify", None)()).may_densify(1)
+    with pytest.raises(AnswerError, match="must give True or False, got 'no'"):
+        Conductor(answering("may_densify", "no")()).may_densify(1)
+
+
+@pytest.mark.parametrize("change", [lambda x: setattr(x, "data", x * 0.9), lambda x: x.resize_(3, 3)])
+def test_a_parameter_that_after_step_gives_other_memory_is_refused_in_a_run(change):
+    made = Conductor(answering("after_step", lambda params, step: change(params["means"]))())
+    with pytest.raises(AnswerError, match=r"after_step\(\) must change means in place"):
+        made.after_step({"means": torch.ones(8, 3)}, toy.step())
 
 
 @dataclass(frozen=True)
