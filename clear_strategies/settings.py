@@ -275,11 +275,14 @@ def _refuse_unknown(
 
 
 def _of_type(value: Any, hint: Any, key: str) -> Any:
-    """The value, if it is of the annotated type; a list becomes the tuple that is asked for."""
+    """The value, if it is of the annotated type; a list becomes the tuple that is asked for, and a text the path."""
     origin = get_origin(hint)
     if isinstance(value, dict) and isinstance(origin, type) and issubclass(origin, Mapping):
         return {name: _of_type(entry, get_args(hint)[1], _joined(key, name)) for name, entry in value.items()}
-    for candidate in (value, tuple(value)) if isinstance(value, list) else (value,):
+    other = (
+        [tuple(value), _tuples(value)] if isinstance(value, list) else [Path(value)] if isinstance(value, str) else []
+    )
+    for candidate in (value, *other):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", BeartypeDecorHintPep585DeprecationWarning)
@@ -291,6 +294,11 @@ def _of_type(value: Any, hint: Any, key: str) -> Any:
     parts = [_joined(key, f.name) for f in fields(hint) if f.init] if is_dataclass(hint) else []
     remedy = f" Set {', '.join(parts)}." if parts else ""
     raise SettingError(f"{key}: must be {_in_words(hint)}, got {shown}.{remedy}")
+
+
+def _tuples(value: Any) -> Any:
+    """Lists in lists as tuples in tuples."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def _is_of(value: Any, hint: Any) -> bool:
@@ -321,7 +329,7 @@ def _in_words(hint: Any) -> str:
         return " or ".join(dict.fromkeys(_in_words(part) for part in inner))
     if origin is Literal:
         return " or ".join(str(value) for value in inner)
-    if origin is tuple:
+    if origin is tuple and inner[1:] != (...,):
         return f"a list of {len(inner)} numbers"
     if isinstance(origin, type) and inner:
         return "a table of names" if issubclass(origin, Mapping) else f"a list, each entry {_in_words(inner[0])}"

@@ -3,6 +3,7 @@
 import random
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import pytest
@@ -70,6 +71,22 @@ def test_a_node_is_built_from_the_inside_out_and_a_partial_waits_for_what_is_mis
     waiting = build(target(call, depth=5, _partial_=True))
     assert waiting("r") == ("r", 5, False, {})
     assert build(target(Outer, share=1.0, on=True)).on is True
+
+
+@dataclass(frozen=True)
+class Listed:
+    at: Path = Path("a")
+    maybe: Path | str | None = None
+    pairs: tuple[tuple[int, int], ...] = ()
+
+
+def test_a_text_becomes_the_path_and_lists_the_tuples_that_are_asked_for():
+    built = build(target(Listed, at="b/c", maybe="d", pairs=[[1, 2], [3, 4]]))
+    assert built == Listed(Path("b/c"), "d", ((1, 2), (3, 4)))
+    with pytest.raises(SettingError, match=r"pairs: must be a list, each entry a list of 2 numbers, got \[\[1\]\]"):
+        build(target(Listed, pairs=[[1]]))
+    with pytest.raises(SettingError, match="at: must be a path, got 3"):
+        build(target(Listed, at=3))
 
 
 REFUSED = {
