@@ -78,9 +78,10 @@ class Hooks:
 
     def __init__(self, strategies: Sequence[Strategy], objective: Objective) -> None:
         for given in strategies:
-            if not isinstance(given, Strategy):
+            if not isinstance(given, Strategy) or not hasattr(given, "state"):  # an __init__ of one's own does not make it
                 raise SettingError(
-                    f"a conductor takes strategies one by one, as Conductor(GCO(), P2G()), got {given!r:.80}."
+                    "a conductor takes strategies one by one, made by the __init__ of their dataclass, as Conductor(GCO(), P2G()), "
+                    f"got {given!r:.80}."
                 )
         self.strategies = tuple(strategies)
         self.objective = objective

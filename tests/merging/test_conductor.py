@@ -29,7 +29,7 @@ from clear_strategies import (
 )  # fmt: skip
 from clear_strategies.core.seeds import dropout_mask
 from clear_strategies.data.priors import BackProjected, Bicubic
-from clear_strategies.errors import AnswerError
+from clear_strategies.errors import AnswerError, SettingError
 from clear_strategies.kernels.losses import reference
 from clear_strategies.merging.logs import computed
 from clear_strategies.schedules import WarmupDecay
@@ -269,6 +269,18 @@ def test_a_parameter_that_after_step_gives_other_memory_is_refused_in_a_run(chan
     made = Conductor(answering("after_step", lambda params, step: change(params["means"]))())
     with pytest.raises(AnswerError, match=r"after_step\(\) must change means in place"):
         made.after_step({"means": torch.ones(8, 3)}, toy.step())
+
+
+class OfOnesOwn(Strategy):
+    def __init__(self):
+        """That of the dataclass makes `state`."""
+
+
+def test_a_strategy_without_state_is_refused_at_once():
+    with pytest.raises(
+        SettingError, match=r"made by the __init__ of their dataclass, .* got OfOnesOwn\(\)"
+    ):
+        Conductor(OfOnesOwn())
 
 
 @dataclass(frozen=True)
