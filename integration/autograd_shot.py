@@ -165,15 +165,16 @@ class AutogradShot:
         tensors = {name: x for name, x in named.items() if x.requires_grad}
         projected = [slot.tensor] if slot.tensor.requires_grad else []  # gsplat's 3DGUT draws without projected centres
         asked: list[Any] = [*tensors.values(), *projected]
+        edges = [*asked, *inputs.edges.values()]
         # Those of f_det are called with its merged gradient, those of the others as `to_leaves` reaches them.
         hooked = [*f_det.values()] if self.found is None else [*self.params.values()]
         results = []
         for cotangent in cotangents:
             with without_hooks(hooked), inputs.collected() as found:
                 # Torch's own nodes and those in C++ compute only what is asked for: the edges, too.
-                each = torch.autograd.grad(
-                    self.image, [*asked, *inputs.edges.values()], cotangent, retain_graph=True, allow_unused=True
-                )
+                each: Sequence[Any] = ()
+                if edges:  # the loop may have frozen all
+                    each = torch.autograd.grad(self.image, edges, cotangent, retain_graph=True, allow_unused=True)
             gradients = [torch.zeros_like(x) if g is None else g for x, g in zip(asked, each, strict=False)]
             screen = gradients[-1] if projected else torch.zeros_like(slot.tensor)
             values = {**found, **dict(zip(tensors, gradients, strict=False))}
