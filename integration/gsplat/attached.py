@@ -25,7 +25,7 @@ from integration.detail import sh0_offset
 from integration.gsplat import calls
 from integration.gsplat.calls import Call, Rasterization
 from integration.gsplat.optimizers import optimizers_of, step_detail
-from integration.gsplat.rows import RowNumbers
+from integration.gsplat.rows import ROWS, RowNumbers
 from integration.host import Host
 from integration.hr_drawing import Drawable, RenderAt
 from integration.replacing import replaced_attribute, replaced_everywhere
@@ -35,6 +35,7 @@ from rasterizers.as_gsplat import rasterizer_of
 from rasterizers.interface import BackendUnavailable, Camera, Rasterizer
 from rasterizers.modes import uncompiled
 from rasterizers.sending import color_on
+from rasterizers.torch_internals import is_transformed
 
 _log = logging.getLogger(__name__)
 
@@ -122,6 +123,7 @@ class Attached:
                 f"params['detail'] must have 3 numbers for each of the {len(means):,} Gaussians, got {[*found]}. "
                 "If other Gaussians were loaded, delete it there and among the optimizers: attach makes new ones."
             )
+        self._added = [*[ROWS] * (state is None), *["detail"] * detail]
         self._optimizers = optimizers
         self._rows = RowNumbers(
             params if state is None else state, lambda: params[self._names["means"]], as_parameter=state is None
@@ -146,7 +148,16 @@ class Attached:
         _MADE.add(self)
 
     def params(self) -> dict[str, Tensor]:
-        """The current leaves, by gsplat's names."""
+        """The current leaves, by gsplat's names.
+
+        Raises:
+            HostError: the loop has taken out what `attach` added.
+        """
+        if lost := [name for name in self._added if name not in self._params]:
+            raise HostError(
+                f"params have lost {' and '.join(lost)}, which attach added. A loop that fills them anew must keep every entry; "
+                "where it has loaded other Gaussians, remove() and attach again."
+            )
         names = self._names | ({"detail": "detail"} if "detail" in self._params else {})
         return {name: self._params[host_name] for name, host_name in names.items()}
 
@@ -173,7 +184,7 @@ class Attached:
             call = signature.bind(*args, **kwargs).arguments
             for name in var_keyword:
                 call |= call.pop(name, {})
-            if self.attachment.removed or not self._draws_colors(call):
+            if self.attachment.removed or is_transformed() or not self._draws_colors(call):
                 return rasterization(**call)
             read, view = functools.cache(functools.partial(calls.cameras_read, call)), None
             if torch.is_grad_enabled():

@@ -15,6 +15,7 @@ from clear_strategies.schedules import Ramp
 from integration import HostError
 from integration.gsplat import calls
 from integration.gsplat.calls import Poses
+from integration.gsplat.rows import ROWS
 from integration.host_merge import HostMerge
 from rasterizers import as_gsplat, autograd
 from rasterizers.geometry import SH_C0
@@ -22,7 +23,7 @@ from tests.helpers import gsplat_host, toy
 from tests.helpers.backends import needs
 from tests.helpers.gsplat_host import Host, started
 from tests.helpers.host_parts import HR_FROM_START, WITHOUT_HR, photometric
-from tests.helpers.loops import FUNCTIONS, Loop, Running, scene
+from tests.helpers.loops import FUNCTIONS, Loop, Running, pictures, scene
 from tests.training.test_replayed_iteration import cropped
 
 
@@ -76,6 +77,36 @@ def test_the_colours_of_the_only_camera_have_the_gradients_of_those_by_gaussian(
     assert found.keys() == expected.keys()
     for name, g in expected.items():
         torch.testing.assert_close(found[name], g, rtol=1e-3, atol=1e-9, msg=name)
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_a_loop_that_trains_what_follows_the_picture_may_freeze_all_gaussians(function):
+    running, gain = Running(Loop(function=function)), torch.nn.Parameter(torch.ones(3))
+    for p in running.splats.values():
+        p.requires_grad_(False)
+    image = pictures(running.loop, running.function, running.tensors(), [])(scene().train[0].lr)[0][0]
+    (image * gain).mean().backward()
+    torch.testing.assert_close(gain.grad, image.mean((0, 1)) / 3)
+
+
+@pytest.mark.parametrize("name", [ROWS, "detail"])
+def test_params_without_what_attach_has_added_are_refused(name):
+    host, _, render = started()
+    del host.splats[name]
+    with pytest.raises(HostError, match=f"params have lost {name}, which attach added"):
+        render()
+
+
+def test_a_transform_of_torch_func_is_refused_by_name_in_a_loop():
+    host, _, _ = started()
+
+    def brightness(means):
+        return gsplat_host.drawn(host.rasterization, {**host.splats, "means": means}, host.photos["view0"].camera)[
+            0
+        ].mean()
+
+    with pytest.raises(NotImplementedError, match=r"the transforms of torch\.func"):
+        torch.func.grad(brightness)(host.splats["means"].detach())
 
 
 def test_a_photo_of_a_part_of_the_gaussians_is_refused():
