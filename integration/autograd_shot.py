@@ -100,6 +100,9 @@ class AutogradShot:
         drawings: of this image by this package's rasterizers; a single one takes all cotangents in one pass.
         mask: the image is a drawing outside of any graph, times this mask.
         found: the inputs of another rasterizer, which `joint_loss` and hosts set.
+
+    Raises:
+        HostError: one of `drawn` has no row for each Gaussian.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -111,6 +114,14 @@ class AutogradShot:
     drawings: Sequence[Drawing] = ()
     mask: Float[Tensor, "H W 1"] | None = None
     found: Inputs | None = None
+
+    def __post_init__(self) -> None:
+        for name, x in (self.drawn or {}).items():
+            if x.shape[:1] != self.visible.shape:
+                raise HostError(
+                    f"AutogradShot: {name} of drawn must have a row for each of the {len(self.visible):,} Gaussians, got "
+                    f"{[*x.shape]}. Draw and name what has: of one camera, gsplat's colours without their first dimension."
+                )
 
     @property
     def drawing(self) -> Drawing | None:

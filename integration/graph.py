@@ -167,16 +167,10 @@ def inputs_of(
     return Inputs(nodes, edges, shared) if is_drawn or (pairs and _are_in_order(pairs)) else None
 
 
-def require_apart(drawn: Mapping[str, Tensor], n: int) -> None:
-    """Raise a HostError if one of the drawn tensors has no row for each of the n Gaussians, or is computed from another, whose
-    gradient would count twice; that of f_det does not.
+def require_apart(drawn: Mapping[str, Tensor]) -> None:
+    """Raise a HostError if one of the drawn tensors is computed from another, whose gradient would count twice; that of f_det
+    does not.
     """
-    for name, x in drawn.items():
-        if x.shape[:1] != (n,):
-            raise HostError(
-                f"AutogradShot: {name} of drawn must have a row for each of the {n:,} Gaussians, got {[*x.shape]}. Draw and name "
-                "what has: of one camera, gsplat's colours without their first dimension."
-            )
     nodes = {name: edge_of(x).node for name, x in drawn.items() if x.requires_grad and name != "detail"}
     for name, node in nodes.items():
         behind = graph_of(drawn[name]).nodes - {node}

@@ -221,7 +221,7 @@ class _HrShot:
     """
 
     def __init__(self, shot: AutogradShot, warn: Callable[..., None]) -> None:
-        require_apart(shot.drawn or {}, len(shot.visible))
+        require_apart(shot.drawn or {})
         shot = at_inputs(shot, warn)
         require_in_order("hr", shot.inputs, shot.params)
         self.image, self.means2d, self.visible, self._shot = shot.image, shot.means2d, shot.visible, shot

@@ -336,7 +336,8 @@ def test_what_is_drawn_may_have_other_rows_than_the_parameters(rows, made, known
         with autograd.collected_drawings() as drawings:
             shot = host.draw(camera, rows(0.5 * detail), **{name: rows(x) for name, x in each.items()})
         drawn = rows(torch.arange(20.0)).long()[:20]
-        slot = ScreenGradientSlot(shot.means2d[: len(drawn)], (camera.width, camera.height), rows=drawn)
+        centres = shot.means2d[: len(drawn)].detach()  # of which no tensor of the graph has these rows
+        slot = ScreenGradientSlot(centres, (camera.width, camera.height), rows=drawn)
         visible = torch.zeros(20, dtype=torch.bool).index_copy_(0, drawn, shot.visible[: len(drawn)])
         means2d = torch.zeros(20, 2).index_copy_(0, drawn, shot.means2d[: len(drawn)].detach())
         images = {
@@ -440,9 +441,8 @@ def test_a_part_of_the_centres_and_colours_by_camera_are_refused_by_name():
     with pytest.raises(HostError, match=r"lr is not computed from its means2d \[20, 2\], .* slot=ScreenGradientSlot\("):
         joint_loss(conductor, host.params, replace(lr, means2d=lr.means2d[:]), hr, view, 5)
     named = host.activated(colors=torch.cat((host.params["sh0"], host.params["shN"]), 1)[None])
-    hr = replace(hr, drawn={name: named[name] for name in ("means", "colors")})
     with pytest.raises(HostError, match=r"colors of drawn must have a row for each of the 20 Gaussians, got \[1, 20, "):
-        joint_loss(conductor, host.params, lr, hr, view, 5)
+        replace(hr, drawn={name: named[name] for name in ("means", "colors")})
 
 
 def test_a_parameter_of_another_name_is_summed():
