@@ -30,7 +30,7 @@ from integration.graph import (
 )
 from rasterizers.differentiable import Drawing, outer
 from rasterizers.interface import Camera, summed_vjp
-from rasterizers.torch_internals import is_hooked
+from rasterizers.torch_internals import is_hooked, version
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,9 +219,11 @@ class AutogradShot:
 
 
 def of_whole_image(shot: AutogradShot) -> AutogradShot:
-    """Without its drawing, if the image depends on parameters by another way, too."""
+    """Without its drawing, if the image depends on parameters by another way, too, or was changed in place, which left no picture
+    to take cotangents of.
+    """
     own, drawing = trained(shot.params).values(), shot.drawing
-    if drawing is None or not reaches(shot.image, own, before=[drawing.image.grad_fn]):
+    if drawing is None or not (version(drawing.image) or reaches(shot.image, own, before=[drawing.image.grad_fn])):
         return shot
     return replace(shot, drawings=())
 

@@ -35,6 +35,7 @@ from integration.autograd_shot import (
     Target,
     at_inputs,
     every_number,
+    of_whole_image,
     side_of_leaves,
     to_leaves,
 )
@@ -189,7 +190,8 @@ class HrDrawing:
         asked = render_at(extra.photo.camera, None, view)
         if isinstance(asked, Drawable):
             return self._own_extra_view(asked, extra, t)
-        (g,) = asked.shot.vjp(self._conductor.extra_loss(asked.shot.image, extra, t).cotangents)
+        shot = of_whole_image(asked.shot)
+        (g,) = shot.vjp(self._conductor.extra_loss(shot.image, extra, t).cotangents)
         return g
 
     def _mask(self, view: View, means: Tensor) -> Float[Tensor, "H W 1"] | None:

@@ -434,6 +434,28 @@ def test_f_det_at_lr_or_not_at_hr_and_a_strategy_that_has_not_started_are_refuse
     assert host.params["detail"].grad is None
 
 
+def test_a_picture_that_is_masked_in_place_has_the_gradients_of_what_is_left():
+    def trained(mask):
+        host, conductor, view, *_ = drawn()
+
+        def render(name):
+            with autograd.collected_drawings() as drawings:
+                shot = host.render(getattr(view, name).camera, detail=name == "hr")
+            return replace(shot, image=mask(shot.image), drawings=drawings)
+
+        joint_loss(conductor, host.params, render("lr"), render("hr"), view, 5)[0].backward()
+        return host.params
+
+    def upper(image):
+        image[len(image) // 2 :] = 0
+        return image
+
+    shown = {n: (torch.arange(n) < n // 2)[:, None, None] for n in (16, 64)}
+    in_place, times = trained(upper), trained(lambda image: image * shown[len(image)])
+    for name, p in times.items():
+        torch.testing.assert_close(in_place[name].grad, p.grad, rtol=1e-4, atol=1e-9, msg=name)
+
+
 def test_a_part_of_the_centres_and_colours_by_camera_are_refused_by_name():
     """As of gsplat's `info`: the screen gradient would be 0, and routing would take each camera for a Gaussian."""
     host, conductor, view, lr, hr = drawn(P2G(patch=4))
