@@ -26,6 +26,7 @@ from integration.graph import (
     inputs_of,
     joined,
     reaches,
+    reaching,
     without_hooks,
 )
 from rasterizers.differentiable import Drawing, outer
@@ -235,7 +236,10 @@ def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
     Args:
         warn: called if the inputs are not found, with a message and its values.
     """
-    if (shot := of_whole_image(shot)).inputs is not None:
+    has_drawings, shot = bool(shot.drawings), of_whole_image(shot)
+    if has_drawings and shot.drawing is None and reaching(shot.drawn or {}):  # only a drawing tells their ways apart
+        shot = replace(shot, drawn=None)
+    if shot.inputs is not None:
         return shot
     graph, centres = graph_of(shot.image), shot.gradient_slot.tensor
     known = {*map(id, shot.params.values()), *map(id, copied_to(centres, shot.params["means"]))}

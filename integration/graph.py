@@ -167,18 +167,24 @@ def inputs_of(
     return Inputs(nodes, edges, shared) if is_drawn or (pairs and _are_in_order(pairs)) else None
 
 
-def require_apart(drawn: Mapping[str, Tensor]) -> None:
-    """Raise a HostError if one of the drawn tensors is computed from another, whose gradient would count twice; that of f_det
-    does not.
-    """
+def reaching(drawn: Mapping[str, Tensor]) -> tuple[str, str] | None:
+    """One of the drawn tensors and another that is computed from it; that of f_det does not count. None: there is no such."""
     nodes = {name: edge_of(x).node for name, x in drawn.items() if x.requires_grad and name != "detail"}
     for name, node in nodes.items():
         behind = graph_of(drawn[name]).nodes - {node}
-        if reaching := [other for other, of_other in nodes.items() if of_other in behind]:
-            raise HostError(
-                f"AutogradShot: {reaching[0]} of drawn reaches {name} of drawn, too, so that its gradient would count twice. "
-                f"Draw an alias, x = {reaching[0]}.view_as({reaching[0]}), and name that."
-            )
+        for other, of_other in nodes.items():
+            if of_other in behind:
+                return other, name
+    return None
+
+
+def require_apart(drawn: Mapping[str, Tensor]) -> None:
+    """Raise a HostError if one of the drawn tensors is computed from another, whose gradient would count twice."""
+    if pair := reaching(drawn):
+        raise HostError(
+            f"AutogradShot: {pair[0]} of drawn reaches {pair[1]} of drawn, too, so that its gradient would count twice. "
+            f"Draw an alias, x = {pair[0]}.view_as({pair[0]}), and name that."
+        )
 
 
 def require_in_order(what: str, drawn: Mapping[str, Tensor] | None, params: Mapping[str, Tensor]) -> None:

@@ -89,6 +89,34 @@ def test_a_loop_that_trains_what_follows_the_picture_may_freeze_all_gaussians(fu
     torch.testing.assert_close(gain.grad, image.mean((0, 1)) / 3)
 
 
+PICTURES = {
+    "masked in place": (lambda draw: draw().mul_(0.5), lambda draw: 0.5 * draw()),
+    "drawn twice": (lambda draw: 0.5 * draw() + 0.5 * draw(), lambda draw: draw()),
+}
+
+
+@pytest.mark.parametrize("made", PICTURES)
+def test_colours_of_the_means_count_once_where_no_single_drawing_is_the_picture(made):
+    """By a function of the loop's own around this package's."""
+
+    def gradients(picture):
+        @functools.wraps(autograd.rasterization)
+        def drawn(*args, **call):
+            found = []
+            image = picture(lambda: found.append(autograd.rasterization(*args, **call)) or found[-1][0])
+            return image, *found[-1][1:]
+
+        running = Running(Loop(colours="by the means"))
+        photo = scene().train[0].lr
+        image = pictures(running.loop, running.clear.wrap(drawn), running.tensors(), [])(photo)[0][0]
+        photometric(image, photo.image).backward()
+        return {name: p.grad for name, p in running.splats.items() if p.grad is not None}
+
+    found, expected = map(gradients, PICTURES[made])
+    for name, g in expected.items():
+        torch.testing.assert_close(found[name], g, rtol=1e-3, atol=1e-6 * float(g.abs().max()), msg=name)
+
+
 @pytest.mark.parametrize("name", [ROWS, "detail"])
 def test_params_without_what_attach_has_added_are_refused(name):
     host, _, render = started()
