@@ -21,7 +21,7 @@ from rasterizers import autograd
 from tests.helpers import toy
 from tests.helpers.host_parts import HR_FROM_START, photometric
 
-rasterization = functools.partial(autograd.rasterization, backend="torch")
+rasterization = functools.partial(autograd.rasterization, backend=rasterizers.fastest("cpu"))
 
 
 def drawn(function, splats, camera, sh_fp16=False, **settings):
@@ -139,7 +139,7 @@ def densified(
     return host, trained(host, scene, conductor, names, strategy=strategy)
 
 
-RASTERIZER = rasterizers.load("torch", near=0.01, kernel=0.3, antialiased=False)
+RASTERIZER = rasterizers.load(rasterizers.fastest("cpu"), near=0.01, kernel=0.3, antialiased=False)
 
 
 def doubled(view: View) -> View:

@@ -2,12 +2,12 @@
 
 import torch
 
-from rasterizers import Camera, Splats, autograd, load
+from rasterizers import Camera, Splats, autograd, fastest, load
 from rasterizers.interface import over
 from tests.helpers.host_parts import InNdc
 
 ABSOLUTE = False
-RASTERIZER = load("torch", near=0.01, kernel=0.3, antialiased=False)
+RASTERIZER = load(fastest("cpu"), near=0.01, kernel=0.3, antialiased=False)
 
 
 def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, columns=3, indices=False):
