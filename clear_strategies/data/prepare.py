@@ -83,7 +83,7 @@ def prepare(
     notes = scene_notes(capture, views, prior, train, test, train_frames[0].camera, initial.cloud, exposure)
     return Scene(
         capture.name, train, test, initial.cloud, capture.background, synthetic_prior="synthetic" in train[0].sr_source,
-        notes=notes, unplaced=capture.unplaced, work_log=work_log,
+        notes=notes, work_log=work_log,
     )  # fmt: skip
 
 

@@ -5,7 +5,7 @@ and alpha leave pixels to train on, for other trainers, too.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -34,7 +34,6 @@ class Scene:
         background: the colour behind the Gaussians.
         synthetic_prior: the SR images contain seeded errors, or the truth (the demo); reports mark such runs.
         notes: label -> fact, for the printed plan and the provenance.
-        unplaced: see `Capture.unplaced`; such photos are not used.
         work_log: how long the views and the initial points took.
     """
 
@@ -45,7 +44,6 @@ class Scene:
     background: Color = (0.0, 0.0, 0.0)
     synthetic_prior: bool = False
     notes: dict[str, str] = field(default_factory=dict)
-    unplaced: Mapping[str, str] = field(default_factory=dict)
     work_log: WorkLog = field(default_factory=WorkLog)
 
     @property

@@ -1,8 +1,7 @@
-"""Projection of points to pixels and back, visibility of points, and sampling of colours. Pixel (0, 0) spans [0, 1)²."""
+"""Projection of points to pixels and back, and sampling of colours. Pixel (0, 0) spans [0, 1)²."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
 import torch
@@ -12,7 +11,6 @@ from torch import Tensor
 from clear_strategies.core.view import Photo
 from rasterizers.interface import Camera
 
-_BEHIND: Final = 0.03  # relative excess over the surface's depth up to which a point is visible
 _NO_WEIGHT: Final = 1e-6  # of a pixel in a bilinear mean
 
 
@@ -47,17 +45,6 @@ def seen_pixels(
     seen = inside(pixels[:, 0], pixels[:, 1], depth, camera.width, camera.height)
     column, row = pixels[seen].long().unbind(dim=1)
     return seen, row, column, depth[seen]
-
-
-def times_seen(
-    points: Float[Tensor, "N 3"], cameras: Sequence[tuple[Camera, Float[Tensor, "h w"]]]
-) -> Int[Tensor, " N"]:
-    """Count for each point the cameras, each given with its depth (nan: no surface), in whose image it is and not occluded."""
-    count = torch.zeros(len(points), dtype=torch.long)
-    for camera, depth in cameras:
-        seen, row, column, z = seen_pixels(camera, points)
-        count[seen] += z <= depth[row, column] * (1 + _BEHIND)
-    return count
 
 
 def back_project(camera: Camera, pixels: Float[Tensor, "G 2"], depth: Float[Tensor, " G"]) -> Float[Tensor, "G 3"]:

@@ -15,15 +15,13 @@ from __future__ import annotations
 
 import copy
 import logging
-import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple, cast
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies import files
@@ -34,9 +32,7 @@ from clear_strategies.core.progress import Progress
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
-from clear_strategies.data.scene import Scene
 from clear_strategies.files import Beside
-from clear_strategies.geometry.projection import times_seen
 from clear_strategies.kernels import reconcile
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs import figures
@@ -44,7 +40,6 @@ from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.answers import rows_like
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.field import FieldShot
-from clear_strategies.viewing.cameras import at_most
 from clear_strategies.viewing.look import Painter, depth_range
 
 _log = logging.getLogger(__name__)
@@ -63,17 +58,6 @@ _NOTE: Final = (
     "at both scales"
 )
 _ALWAYS_ON: Final = WarmupDecay(start=0, full=1, decay_from=1, end=1)  # λ_HR = 1 from the first iteration
-
-# Settings of maps/coverage.png, which shows how many photos see each part of the scene:
-_COMPARED: Final = 64  # largest number of photos that are counted
-_LONGER_SIDE: Final = 96  # px, of the depth of a photo
-_SOLID: Final = 0.3  # opacity of the Gaussians that count as surface
-_MOST_POINTS: Final = 60_000  # on the map
-_COLORS: Final = {
-    "no photo": figures.RED, "one photo": figures.YELLOW, "two photos": figures.CYAN, "three or more": figures.BLUE,
-}  # fmt: skip
-_CROP: Final = 0.03  # share of the points that lie beyond each side of the map
-_LONGEST_NOTE: Final = 400  # characters below the map
 
 
 class ViewMaps(NamedTuple):
@@ -206,62 +190,3 @@ def _compare(lr: Grads, hr: Grads, corrected: Grads | None) -> tuple[dict[str, T
         numbers["corrected"] = torch.where(compared, lost.sqrt().clamp(0, 1), 0.0)
     numbers["conflict"] = ((dot < 0) & compared).to(dot)
     return numbers, compared
-
-
-def coverage_of(scene: Scene, painter: Painter) -> tuple[Float[Tensor, "N 3"], Int[Tensor, " N"]]:
-    """Points of the field's surface, and the number of training photos that see each of them."""
-    field, photos = painter.field, [view.hr.camera for view in scene.train]
-    small = [at_most(camera, _LONGER_SIDE) for camera in figures.spaced(photos, _COMPARED)]
-    solid = field.means.data[field.opacities.data.sigmoid() > _SOLID].cpu()
-    points = solid[:: -(-len(solid) // _MOST_POINTS) or 1]
-    return points, times_seen(points, [(camera, painter.depth(camera)) for camera in small])
-
-
-def write_coverage(path: Path, scene: Scene, painter: Painter, title: str, beside: Beside) -> None:
-    """Draw the points, coloured by the number of photos that see them, fewer ones on top, and the cameras. Nothing is drawn if no
-    Gaussian is a surface yet.
-    """
-    points, times = coverage_of(scene, painter)
-    if len(points):
-        beside(_draw_coverage, path, scene, points, times, title)
-    else:
-        _log.info("%s: left out, no Gaussian is more opaque than %g.", path.name, _SOLID)
-
-
-def _draw_coverage(
-    path: Path, scene: Scene, points: Float[Tensor, "N 3"], times: Int[Tensor, " N"], title: str
-) -> None:
-    times = times.clamp(max=len(_COLORS) - 1)
-    figure, ((axis,),) = figures.new_figure(1, 1, 8, 7)
-    poses = torch.stack([view.hr.camera.world_to_camera[:3, :3].double().cpu() for view in scene.train])
-    places = torch.stack([view.hr.camera.center.double().cpu() for view in scene.train])
-    plane = _from_above(poses)
-    flat, centers, ahead = (x.numpy() @ plane for x in (points.double(), places, poses[:, 2]))
-    for seen, (name, color) in reversed([*enumerate(_COLORS.items())]):
-        those = (times == seen).numpy()
-        label = f"seen by {name}: {those.mean():.0%}"
-        axis.scatter(*flat[those].T, s=4, marker="s", color=color, linewidths=0, label=label)
-    axis.quiver(*centers.T, *ahead.T, color=figures.INK, angles="xy", scale=18, width=0.005)
-    inner = np.quantile(flat, (_CROP, 1 - _CROP), axis=0)
-    shown = np.concatenate([inner, centers])
-    margin = max(0.06 * float(np.ptp(inner, axis=0).max()), 1e-6)
-    low, high = shown.min(0) - margin, shown.max(0) + margin
-    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    axis.set_axis_off()
-    figure.legend(loc="outside lower left", ncols=2, fontsize=8, frameon=False, markerscale=4, reverse=True)
-    if scene.unplaced:
-        listed = "; ".join(f"{name}: {why}" for name, why in scene.unplaced.items())
-        note = textwrap.fill(
-            textwrap.shorten(f"without a pose, so not used: {listed}", _LONGEST_NOTE, placeholder=" …"), 110
-        )
-        axis.text(0, 0, note, fontsize=8, va="bottom", transform=axis.transAxes, **figures.AS_WRITTEN)
-    figures.set_title(figure, f"{title}: what the photos see, from above")
-    figures.save(figure, path)
-
-
-def _from_above(poses: Float[Tensor, "C 3 3"]) -> Float[np.ndarray, "3 2"]:
-    """The horizontal plane: right and ahead of the first camera, orthogonal to the mean of the cameras' up."""
-    up = torch.nn.functional.normalize(-poses[:, 1].mean(0), dim=0)
-    ahead = poses[0, 2] - (poses[0, 2] @ up) * up
-    ahead = torch.nn.functional.normalize(ahead if ahead.norm() > 1e-3 else poses[0, 1], dim=0)
-    return np.asarray(torch.stack([torch.linalg.cross(ahead, up), ahead], dim=1).numpy())

@@ -26,7 +26,7 @@ from clear_strategies.errors import DataError, SettingError, counted, one_line
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.figures import SheetRow, spaced, write_contact_sheet, write_curves
 from clear_strategies.outputs.image_scores import Metric
-from clear_strategies.outputs.maps import MAPS, write_coverage, write_maps
+from clear_strategies.outputs.maps import MAPS, write_maps
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen
 from clear_strategies.outputs.provenance import provenance
@@ -44,10 +44,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_COVERAGE: Final = "maps/coverage.png"
 _OF_RUN: Final = (
     "contact_sheet.jpg", "curves.png", "history.csv", "conflict.csv", "timing.csv", "point_cloud.ply", "path.mp4",
-    cameras.FILE, "maps/maps.json", _COVERAGE,
+    cameras.FILE, "maps/maps.json",
 )  # fmt: skip
 _OF_VIEW: Final = (
     "renders/{}.png", *(f"views/{{}}_{k}.png" for k in ("lr", "prior", "truth")),
@@ -98,7 +97,6 @@ def write_results(
                     )
                 except Exception as error:  # of a user's strategy; the run must not fail by it
                     _log.warning("maps: left out, %s: %s", type(error).__name__, one_line(error))
-                write_coverage(folder / _COVERAGE, scene, painter, title, beside)
         memory.release()  # of the maps' gradients, several times the size of the field
         with work_log.stage("evaluate"):
             evaluation = metrics.evaluate(scene, render, down=down, own=own)

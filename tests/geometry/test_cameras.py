@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from clear_strategies.core.view import Photo
 from clear_strategies.geometry.cameras import common_box, partners
-from clear_strategies.geometry.projection import project, sample_colors, times_seen
+from clear_strategies.geometry.projection import project, sample_colors
 from rasterizers.interface import Camera
 from tests.helpers import planes
 from tests.helpers.planes import camera, photo
@@ -58,21 +58,14 @@ def test_few_cameras_are_all_compared_and_of_many_the_nearest_and_some_far_ones_
     assert all(len({b // 15 for b in others}) > 1 for others in partners(bursts))
 
 
-# ---- colours between pixel centres, and which cameras see a surface
-def test_colours_lie_between_pixel_centres_and_a_point_is_seen_inside_a_camera_if_not_hidden():
+# ---- colours between pixel centres
+def test_colours_lie_between_pixel_centres_and_hidden_ones_count_in_no_mean():
     pair = Photo(replace(small_camera(0.0), width=2, height=1), torch.tensor([[[0.0, 0, 0], [1.0, 1, 1]]]))
     at = torch.tensor([[0.5, 0.5], [1.0, 0.5], [1.25, 0.5], [1.5, 0.5], [0.1, 0.2]])
     assert torch.allclose(sample_colors(pair, at)[:, 0], torch.tensor([0, 0.5, 0.75, 1, 0]))
     for colors in (pair.image, pair.image + 0.5):  # whatever colour a mask hides
         hidden = replace(pair, image=colors, shown=torch.tensor([[False, True]]))
         assert torch.allclose(sample_colors(hidden, at[1:4]), colors[0, 1])
-    wall = torch.full((10, 10), 1.0)
-    across = torch.arange(10) / 10 - 0.45  # the centres of a row of pixels at a depth of 1
-    points = torch.stack((across, torch.zeros(10) + 0.05, torch.ones(10)), dim=1)
-    beside = times_seen(points, [(small_camera(0.5), wall), (small_camera(0.0), wall)])  # 5 pixels aside
-    assert beside.tolist() == [1] * 5 + [2] * 5
-    for depth, seen in ((wall * 0.5, 0), (wall * 2, 1), (wall * torch.nan, 0)):  # before, behind, unknown
-        assert times_seen(points, [(small_camera(0.0), depth)]).unique().tolist() == [seen]
 
 
 def small_camera(x: float) -> Camera:

@@ -76,7 +76,7 @@ def not_drawn() -> Iterator[None]:
     from clear_strategies.outputs import results
 
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("write_curves", "write_contact_sheet", "write_coverage"):
+        for name in ("write_curves", "write_contact_sheet"):
             patch.setattr(results, name, lambda *_: None)
         yield
 

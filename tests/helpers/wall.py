@@ -2,9 +2,6 @@
 
 import torch
 
-from clear_strategies.core.points import PointCloud
-from clear_strategies.core.view import Photo, View
-from clear_strategies.data.scene import Scene
 from clear_strategies.training.field import GaussianField
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Camera
@@ -14,16 +11,6 @@ from tests.helpers import planes, toy
 def at(x: float) -> Camera:
     """Four units before the wall; sees 4.8 of its width."""
     return planes.camera(x, 60, 40, 50.0)
-
-
-def scene(*x: float) -> Scene:
-    """Black photos from these places."""
-    views = []
-    for i, place in enumerate(x):
-        camera = at(place)
-        lr = Photo(camera.scaled(0.5), torch.zeros(20, 30, 3))
-        views.append(View(f"photo{i}", lr, Photo(camera, torch.zeros(40, 60, 3))))
-    return Scene("wall", tuple(views), (), PointCloud(torch.zeros(1, 3), torch.zeros(1, 3), "none"))
 
 
 def painter() -> Painter:

@@ -1,16 +1,12 @@
-"""Figures, curves, maps of coverage and the contact sheet show what they are given and nothing else."""
+"""Figures, curves and the contact sheet show what they are given and nothing else."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
 from matplotlib.figure import Figure
 
-from clear_strategies.files import Beside
-from clear_strategies.outputs import figures, maps
+from clear_strategies.outputs import figures
 from clear_strategies.outputs.figures import SheetRow, magnification, window, write_contact_sheet
-from tests.helpers import wall
 from tests.helpers.image_files import array, holds, read
 
 
@@ -22,30 +18,6 @@ from tests.helpers.image_files import array, holds, read
 def test_spaced_items_are_at_most_as_many_as_asked_for(count: int, expected: list[int]) -> None:
     assert list(figures.spaced(range(10), count)) == expected
     assert list(figures.spaced([], count)) == []
-
-
-# ---- maps/coverage.png: how many photos see each point, and photos without a pose
-SCENE = wall.scene(-1.0, 0.0, 1.0)
-
-
-def test_a_point_is_seen_by_the_photos_whose_frame_it_lies_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    points, times = maps.coverage_of(SCENE, wall.painter())
-    inside = sum((abs(points[:, 0] - x) < 2.3) & (abs(points[:, 1]) < 1.5) for x in (-1.0, 0.0, 1.0))
-    outside = sum((abs(points[:, 0] - x) < 2.5) & (abs(points[:, 1]) < 1.7) for x in (-1.0, 0.0, 1.0))
-    assert bool(((inside <= times) & (times <= outside)).all())
-    assert set(times.tolist()) == {0, 1, 2, 3}
-    monkeypatch.setattr(maps, "_MOST_POINTS", 5)
-    assert 0 < len(maps.coverage_of(SCENE, wall.painter())[0]) <= 5
-
-
-def test_the_map_has_the_colours_of_its_legend_and_dollars_are_no_mathematics(tmp_path: Path) -> None:
-    scene = replace(SCENE, unplaced={"b$1_$.jpg": "12 features: blurred, dark, or without texture"})
-    with Beside() as beside:
-        maps.write_coverage(tmp_path / "coverage.png", scene, wall.painter(), "toy $20_$", beside)
-        beside.finish()
-    drawn = torch.from_numpy(read(tmp_path / "coverage.png").copy()).flatten(0, 1)
-    for color in maps._COLORS.values():
-        assert int((drawn == torch.tensor(list(bytes.fromhex(color[1:])))).all(1).sum()) > 50
 
 
 # ---- the contact sheet shows what it is given, pixel for pixel

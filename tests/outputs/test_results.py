@@ -116,10 +116,7 @@ def test_photos_with_similar_names_have_files_of_their_own_that_go_together(rig,
     stems = TWINS[rig]
     assert names(tmp_path / "renders") == {f"{stem}.png" for stem in stems}
     assert {name.rpartition("_")[0] for name in names(tmp_path / "views")} == stems
-    assert names(tmp_path / "maps") == {
-        "maps.json",
-        *(f"{stem}/" for stem in stems),
-    }  # of no surface there is no coverage
+    assert names(tmp_path / "maps") == {"maps.json", *(f"{stem}/" for stem in stems)}
     results.remove_earlier(tmp_path, all_files=True)
     assert names(tmp_path) == set()
 
