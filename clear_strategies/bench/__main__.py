@@ -50,13 +50,6 @@ QUESTIONS: Final[Mapping[str, tuple[str, Options]]] = {
         "--width": {"type": positive, "default": 128, "metavar": "PX", "help": "of the LR photos (default 128)"},
         **_TURNS, "--repeats": {**_TURNS["--repeats"], "default": 20},
     }),
-    "scale": ("how time and memory grow with Gaussians, pixels and photos", {
-        "--gaussians": {"nargs": "*", "type": positive, "default": [1_000, 10_000, 100_000, 1_000_000], "metavar": "N"},
-        "--widths": {"nargs": "*", "type": positive, "default": [252, 504, 1008, 2016], "metavar": "PX"},
-        "--photos": {"nargs": "*", "type": positive, "default": [10, 50, 200], "metavar": "N"},
-        "--iterations": {"type": positive, "default": 200, "metavar": "N", "help": "of a run (default 200)"},
-        "--repeats": _TURNS["--repeats"],
-    }),
 }  # fmt: skip
 
 

@@ -3,7 +3,6 @@
 import json
 import math
 from functools import partial
-from multiprocessing import get_context
 
 import pandas as pd
 import pytest
@@ -11,7 +10,7 @@ import torch
 
 import rasterizers
 from clear_strategies import GCO, P2G, SVS, DataError, Objective
-from clear_strategies.bench import iteration, scale, scenes
+from clear_strategies.bench import iteration, scenes
 from clear_strategies.bench import rasterizers as drawing
 from clear_strategies.bench import results as timing
 from clear_strategies.bench.__main__ import main
@@ -118,18 +117,6 @@ def test_an_iteration_is_measured_with_and_without_hr():
     assert 0 < table.loc[stages, "error"].max() < 1e-4
     assert list(table.index[-2:]) == [iteration.REST, iteration.TOTAL]
     assert math.isnan(table.loc["backward HR", "lr_only_ms"])
-
-
-def test_growth_has_an_exponent_for_each_step_and_none_across_what_grows(monkeypatch):
-    for name, size in {"_WIDTH": 96, "_GAUSSIANS": 100}.items():
-        monkeypatch.setattr(scale, name, size)
-    forking = get_context("forkserver")  # in place of "spawn": the processes share their imports
-    forking.set_forkserver_preload([scale.__name__])
-    monkeypatch.setattr(scale, "get_context", lambda _: forking)
-    table = measured(scale, gaussians=[200, 100], widths=[96], photos=[], iterations=1, repeats=1).tables["scale"]
-    assert list(table["size"]) == [100, 200, 96 * 72]
-    assert [math.isnan(p) for p in table["exponent"]] == [True, False, True]
-    assert table["exponent"][1] == pytest.approx(math.log2(table["ms"][1] / table["ms"][0]))
 
 
 # ---- what the benchmark draws
