@@ -13,7 +13,8 @@ from clear_strategies.training.field import GaussianField
 from integration import AutogradShot, HostError, ScoreScaler, extra_loss, graph, joint_loss
 from integration.autograd_shot import ScreenGradientSlot
 from rasterizers import autograd
-from tests.helpers import toy, two_processes
+from tests.helpers import toy
+from tests.helpers.command_line import started
 from tests.helpers.host_parts import HR_FROM_START, shot_of
 
 
@@ -490,4 +491,7 @@ def test_a_rendering_of_another_view_than_the_one_that_is_passed_is_refused(draw
 
 
 def test_processes_that_average_its_gradients_train_the_same_field(tmp_path):
-    torch.multiprocessing.spawn(two_processes.train, (f"{tmp_path}/group",), nprocs=2)
+    code = "import sys; from tests.helpers import two_processes; two_processes.train(int(sys.argv[1]), sys.argv[2])"
+    said = [tmp_path / name for name in ("first", "second")]
+    both = [started("-c", code, str(k), f"{tmp_path}/group", cwd=tmp_path, said=said[k]) for k in range(2)]
+    assert [process.wait() for process in both] == [0, 0], [file.read_text() for file in said]
