@@ -1,4 +1,4 @@
-"""The merge of a host's gradients, which is recorded and replayed on CUDA: 22 of the kernels that it launches are GCO's.
+"""The merge of a host's gradients, recorded and replayed on CUDA.
 
 A host's gradients are new tensors in each step, so a recording reads copies of them, and its result is copied to the host's
 tensors. It reads in place the parameters, and what strategies that reconcile or regularize store.
