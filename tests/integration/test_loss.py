@@ -103,11 +103,10 @@ def test_its_value_is_the_sum_of_the_losses_and_backward_writes_the_score_for_a_
     assert torch.allclose(written.norm(dim=1), 2 * update.score)
 
 
-@pytest.mark.parametrize("search", [None, "strong_wolfe"])
-def test_lbfgs_trains_by_a_closure_that_is_called_several_times_in_a_step(search):
+def test_lbfgs_trains_by_a_closure_that_is_called_several_times_in_a_step():
     host, conductor, view, *_ = drawn(GCO(), P2G(patch=4), SVS())
     conductor.on_fit_start(3, 0)
-    optimizer = torch.optim.LBFGS([*host.params.values()], lr=0.05 if search is None else 1, line_search_fn=search)
+    optimizer = torch.optim.LBFGS([*host.params.values()], line_search_fn="strong_wolfe")
 
     def closure():
         optimizer.zero_grad()

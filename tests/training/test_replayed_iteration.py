@@ -326,7 +326,6 @@ class ByTime(cs.Strategy):
             "a tensor": lambda: 0.5 + 0.5 * (t > torch.ones(len(products.dot))),
             "the name": lambda: 0.5 if name.endswith("1") else 1.0,
             "a text": lambda: 0.5 if f"{self.seed}-{t}".endswith("5") else 1.0,
-            "a key": lambda: {"at view1": 0.5}.get(f"at {name}", 1.0),
             "the camera": lambda: step.view.hr.camera.cx / 100,
             "the depth": lambda: 1.0 if step.view.depth is None else step.view.depth.confidence.mean().double() / 2,
             "the prior": lambda: 0.5 if step.view.sr_source == "made" else 1.0,
@@ -345,7 +344,7 @@ def test_what_a_strategy_decides_by_the_iteration_holds_in_replays_or_they_are_r
 
 
 NO_GUARD = (
-    "every second", "a number", "a tensor", "the name", "an anchor", "a text", "a key", "the camera", "the depth", "the prior",
+    "every second", "a number", "a tensor", "the name", "an anchor", "a text", "the camera", "the depth", "the prior",
 )  # fmt: skip
 
 
