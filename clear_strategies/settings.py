@@ -162,9 +162,8 @@ def _called(node: Mapping[str, Any], key: str) -> Any:
 
 def _place_in_module(error: Exception) -> str:
     """File and line of the module that raises while it is imported; empty where the module is not there."""
-    passed_on = re.compile(
-        r"importlib|[/\\]dataclasses\.py$"
-    )  # dataclasses: what a decorator refuses is written below it
+    # What the decorator of a dataclass refuses is written below it.
+    passed_on = re.compile(r"importlib|[/\\]dataclasses\.py$")
     last = [frame for frame in traceback.extract_tb(error.__traceback__) if not passed_on.search(frame.filename)][-1]
     return "" if last.filename == __file__ else f"{last.filename}:{last.lineno}"
 

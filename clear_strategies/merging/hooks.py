@@ -78,10 +78,11 @@ class Hooks:
 
     def __init__(self, strategies: Sequence[Strategy], objective: Objective) -> None:
         for given in strategies:
-            if not isinstance(given, Strategy) or not hasattr(given, "state"):  # an __init__ of one's own does not make it
+            made = isinstance(given, Strategy) and hasattr(given, "state")  # an __init__ of one's own makes no state
+            if not made:
                 raise SettingError(
-                    "a conductor takes strategies one by one, made by the __init__ of their dataclass, as Conductor(GCO(), P2G()), "
-                    f"got {given!r:.80}."
+                    "a conductor takes strategies one by one, made by the __init__ of their dataclass, as "
+                    f"Conductor(GCO(), P2G()), got {given!r:.80}."
                 )
         self.strategies = tuple(strategies)
         self.objective = objective

@@ -277,9 +277,7 @@ class OfOnesOwn(Strategy):
 
 
 def test_a_strategy_without_state_is_refused_at_once():
-    with pytest.raises(
-        SettingError, match=r"made by the __init__ of their dataclass, .* got OfOnesOwn\(\)"
-    ):
+    with pytest.raises(SettingError, match=r"made by the __init__ of their dataclass, .* got OfOnesOwn\(\)"):
         Conductor(OfOnesOwn())
 
 
