@@ -47,7 +47,6 @@ REFUSED: Final = {
 """Options of trainers, or single values of them, that need CUDA; and what to do instead."""
 _RETURNS_INDICES: Final = re.compile(r"std::tuple|\w, *\w+ *= *distCUDA2\(")
 """Of FSGS's distCUDA2: its declaration, or a call of it."""
-_UNPACKED: Final = re.compile(r"^\s*((?:\w+\s*,\s*)+\w+)\s*=\s*rasterizer\(", re.MULTILINE)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -84,9 +83,6 @@ def prepared(script: Path, arguments: Sequence[str] = ()) -> launcher.Trainer:
         "simple_knn": ModuleType("simple_knn"), "simple_knn._C": _knn(renderer),
     }  # fmt: skip
     sources = [] if renderer is None else [file.read_text(encoding="utf-8") for file in renderer.glob("*.py")]
-    unpacked = [names for source in sources for names in _UNPACKED.findall(source)]
-    diff_gaussian_rasterization.UNPACKED.clear()
-    diff_gaussian_rasterization.UNPACKED.update(tuple(name.strip() for name in names.split(",")) for names in unpacked)
     draws_with_gsplat = renderer is None or any("gsplat" in source for source in sources)
     if draws_with_gsplat and importlib.util.find_spec("gsplat") is not None:
         gsplat_functions.replace()

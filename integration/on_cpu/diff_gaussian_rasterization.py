@@ -5,7 +5,7 @@ A fork is known by its settings, and gets what its own rasterizer returns:
 | settings | trainers | returns |
 |---|---|---|
 | 3DGS's alone | 3DGS before October 2024, DropGaussian | image, radii |
-| the same, and `UNPACKED` names them | Binocular3DGS and others of few views | image, radii, depth [1, H, W], alpha [1, H, W] |
+| the same, and the call unpacks more | Binocular3DGS and others of few views | what it names depth, invdepth or alpha [1, H, W] |
 | `antialiasing` | 3DGS | image, radii, inverse depth [1, H, W] |
 | `kernel_size`, `subpixel_offset` | Mip-Splatting | image, radii |
 | `confidence` | FSGS, NexusGS | image, radii, depth [1, H, W], alpha [1, H, W] |
@@ -16,9 +16,14 @@ the projected centres in NDC; for Mip-Splatting its third column is Σ (|∂L/�
 
 from __future__ import annotations
 
+import ast
 import functools
 import inspect
+import linecache
+import sys
 from collections.abc import Callable, Sequence
+from itertools import islice
+from types import CodeType
 from typing import Any, Final, NamedTuple, cast
 
 import torch
@@ -37,9 +42,6 @@ from rasterizers.reference.projection import footprints
 
 _NEAR: Final = 0.2  # what 3DGS draws begins at this depth
 _KERNEL: Final = 0.3  # its 2D kernel's variance, px²
-_OF_FSGS: Final = ("depth", "alpha")
-UNPACKED: Final = set[tuple[str, ...]]()
-"""The names to which the trainer's renderer unpacks what its rasterizer returns; empty: unknown."""
 
 
 class OwnRasterizerError(HostError, ImportError):
@@ -128,13 +130,18 @@ class GaussianRasterizer(torch.nn.Module):
 
     def __init__(self, raster_settings: GaussianRasterizationSettings) -> None:
         super().__init__()
-        self.raster_settings = raster_settings
+        self.raster_settings, self._names = raster_settings, cast(Sequence[str], ())
         for name, neutral in (("subpixel_offset", 0), ("confidence", 1)):
             value = getattr(raster_settings, name)
             if value is not None and bool((value != neutral).any()):
                 raise ValueError(
                     f"{name} must be {neutral} everywhere on a CPU; other values need the CUDA rasterizer."
                 )
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        caller = sys._getframe(1)
+        self._names = _unpacked(caller.f_code, caller.f_lasti)
+        return super().__call__(*args, **kwargs)
 
     def markVisible(self, positions: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:  # noqa: N802 - the name of 3DGS
         """Whether each position is far enough in front of the camera."""
@@ -183,11 +190,11 @@ class GaussianRasterizer(torch.nn.Module):
         image = image.permute(2, 0, 1).contiguous()
         radii = _radii(drawn.visible, inputs, camera, kernel)
         if s.confidence is not None:
-            kinds: Sequence[str] = _OF_FSGS
+            kinds: Sequence[str] = ("depth", "alpha")
         elif s.antialiasing is not None:
             kinds = ("inverse",)
         else:
-            kinds = _unpacked() if s.kernel_size is None else ()
+            kinds = [kind for kind in map(_kind, self._names[2:]) if kind] if s.kernel_size is None else ()
 
         def drawn_as(kind: str) -> Tensor:
             if kind == "alpha":
@@ -196,15 +203,28 @@ class GaussianRasterizer(torch.nn.Module):
             return _sum(rasterizer, camera, inputs, 1 / z if kind == "inverse" else z)
 
         returned = image, radii, *map(drawn_as, kinds)
-        if UNPACKED and all(len(names) != len(returned) for names in UNPACKED):
-            raise OwnRasterizerError(f"what it returns ({'; '.join(map(', '.join, sorted(UNPACKED)))})")
+        if self._names and len(self._names) != len(returned):
+            raise OwnRasterizerError(f"what it returns ({', '.join(self._names)})")
         return returned
 
 
-def _unpacked() -> Sequence[str]:
-    """What a renderer with 3DGS's settings unpacks behind the radii, if these are depths and alphas alone."""
-    found = [["".join(kind for kind in _OF_FSGS if kind in name) for name in names[2:]] for names in UNPACKED]
-    return max((kinds for kinds in found if all(kind in _OF_FSGS for kind in kinds)), key=len, default=())
+def _kind(name: str) -> str:
+    """What a renderer expects behind the radii, by the name that it gives it; "": unknown."""
+    if "depth" in name:
+        return "inverse" if "inv" in name else "depth"
+    return "alpha" if "alpha" in name else ""
+
+
+@functools.cache
+def _unpacked(code: CodeType, instruction: int) -> Sequence[str]:
+    """The names to which this call unpacks its result; none: it does not, or one has a star."""
+    here = next(islice(code.co_positions(), instruction // 2, None))
+    for node in ast.walk(ast.parse("".join(linecache.getlines(code.co_filename)))):
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple):
+            call, parts = node.value, node.targets[0].elts
+            if here == (call.lineno, call.end_lineno, call.col_offset, call.end_col_offset):
+                return () if any(isinstance(part, ast.Starred) for part in parts) else [*map(ast.unparse, parts)]
+    return ()
 
 
 def _gradient_probe(

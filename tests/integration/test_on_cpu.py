@@ -3,7 +3,9 @@
 import importlib
 import math
 import re
+import runpy
 import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,7 +14,7 @@ from safetensors.torch import load_file
 
 from clear_strategies.errors import HostError
 from integration.on_cpu import diff_gaussian_rasterization, gsplat_functions
-from integration.on_cpu.__main__ import _UNPACKED, REFUSED, _knn, _OwnRasterizers
+from integration.on_cpu.__main__ import REFUSED, _knn, _OwnRasterizers
 from integration.on_cpu.diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
 from integration.on_cpu.fused_ssim import fused_ssim
 from integration.on_cpu.simple_knn import distances_and_indices
@@ -346,30 +348,44 @@ def test_a_fork_that_needs_its_own_rasterizer_is_told_so(use, named, monkeypatch
         use()
 
 
+RENDERER = """
+def render(rasterizer, given, otherwise=False):
+    if otherwise:
+        image, radii, depth, alpha = rasterizer(**given)
+    number, _, _ = [len(rasterizer(**given))] * 3
+    {unpacked} = rasterizer(
+        **given)
+    return {unpacked}
+"""
+
+
 @pytest.mark.parametrize(
-    ("unpacked", "shapes"),
+    ("unpacked", "drawn"),
     [
         ("rendered_image, radii", []),
-        ("image, radii, depth", [(1, HEIGHT, WIDTH)]),
-        ("rendered_image, radii, rendered_depth,\n        rendered_alpha", [(1, HEIGHT, WIDTH)] * 2),
+        ("image, radii, depth", ["depth"]),
+        ("image, radii, alpha", ["alpha"]),
+        ("self.image, self.radii, invdepth", ["inverse"]),
+        ("rendered_image, radii, rendered_depth,\\\n        rendered_alpha", ["depth", "alpha"]),
         ("rendered_image, radii, pixels", None),
         ("image, radii, depth, alpha, idx, weights", None),
     ],
 )
-def test_a_fork_with_3dgss_settings_gets_what_its_renderer_unpacks_or_is_refused(unpacked, shapes, monkeypatch):
-    """Binocular3DGS, SCGaussian; Pixel-GS and LoopSparseGS have rasterizers of their own."""
-    (names,) = _UNPACKED.findall(f"def render():\n    {unpacked} = rasterizer(means3D=means3D)")
-    monkeypatch.setattr(diff_gaussian_rasterization, "UNPACKED", {tuple(name.strip() for name in names.split(","))})
+def test_a_fork_with_3dgss_settings_gets_what_its_call_unpacks_or_is_refused(unpacked, drawn, tmp_path):
+    """Binocular3DGS, SCGaussian; Pixel-GS and LoopSparseGS have rasterizers of their own. Other calls unpack what they want."""
+    (tmp_path / "renderer.py").write_text(RENDERER.format(unpacked=unpacked))
+    render = runpy.run_path(str(tmp_path / "renderer.py"), {"self": SimpleNamespace()})["render"]
     draw, given = GaussianRasterizer(settings("dropgaussian")), cloud()
-    if shapes is None:
+    if drawn is None:
         with pytest.raises(HostError, match=f"for what it returns .*{unpacked}.*, and with it a GPU"):
-            draw(**given)
+            render(draw, given)
         return
-    _, _, *more = draw(**given)
-    assert [x.shape for x in more] == shapes
-    of_fsgs = GaussianRasterizer(settings("fsgs"))
-    monkeypatch.setattr(diff_gaussian_rasterization, "UNPACKED", set())
-    assert all(torch.equal(x, y) for x, y in zip(more, of_fsgs(**given)[2:], strict=False))
+    depth, alpha = GaussianRasterizer(settings("fsgs"))(**given)[2:]
+    inverse = GaussianRasterizer(settings("3dgs"))(**given)[2]
+    expected = {"depth": depth, "alpha": alpha, "inverse": inverse}
+    _, _, *more = render(draw, given)
+    assert len(more) == len(drawn)
+    assert all(torch.equal(x, expected[kind]) for x, kind in zip(more, drawn, strict=True))
 
 
 def test_a_fork_may_do_without_what_it_tries_to_import(tmp_path):
