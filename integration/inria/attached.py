@@ -98,7 +98,7 @@ class Attached:
             raise HostError(
                 f"the Gaussians of {type(gaussians).__name__} must be rows of {', '.join(rows)}, got "
                 f"{', '.join(map(str, rows.values()))} rows. A trainer that computes them from other parameters, as SCGaussian "
-                "does their positions, does not work."
+                "does their positions, does not work. FSGS and Binocular3DGS, also for few photos, do."
             )
         if "save_ply" in vars(gaussians):
             raise HostError("these gaussians are attached already; remove() the attachment that did it first.")
