@@ -563,6 +563,16 @@ def test_a_setup_of_an_earlier_stage_that_takes_no_options_is_the_hosts_own(
     assert "4 merges" in caplog.text
 
 
+def test_an_object_that_has_kept_render_since_before_the_setup_draws_with_the_strategies(
+    inria_host, inria_launched, caplog
+):
+    """As EDGS's does."""
+    change = SETUP, f"global render\n    kept = render\n    {SETUP}\n    render = kept"
+    assert inria_launched("--iterations", "4", change=change) == 0
+    assert "4 merges" in caplog.text
+    assert "4 HR renders" in caplog.text
+
+
 def test_a_model_that_would_train_without_the_strategies_is_refused_at_its_first_rendering(
     inria_host, inria_launched, caplog, monkeypatch
 ):
