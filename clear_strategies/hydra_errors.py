@@ -67,8 +67,9 @@ def no_option(group: str, name: object, listed: Sequence[str], config: str = "co
         groups = [other for other in groups if other in chosen]
     near = [f"{'' if other in chosen else '+'}{other}={name}" for other in groups]
     near += difflib.get_close_matches(str(name), listed, 1)
-    if set(several := re.split(r"[+ ]+", str(name))) <= {*listed}:  # as the title of a run has them
-        near = [f"'{'' if group in chosen else '+'}{group}=[{','.join(several)}]'"]
+    several = re.split(r"[+ ]+", str(name))  # as the title of a run has them
+    if group == "strategy" and {*several} <= {*listed}:
+        near = [f"'+strategy=[{','.join(several)}]'"]
     suggestion = f" Did you mean {' or '.join(near)}?" if near else ""
     return f"{group}={name}: there is no such option.{suggestion} There are {', '.join(listed)}."
 
@@ -139,8 +140,10 @@ def _remedy(key: str, value: str, overrides: Sequence[str], known: Mapping[str, 
             "Hydra composes a sweep first without what is swept, here the strategies. Sweep this setting, too "
             f"({key}=a,b), or name the strategies that remain (+strategy=[gco,svs])."
         )
-    elif not beside and parent in {f"strategies.{option}" for option in options("strategy")}:
-        remedy = f"Its strategy is not in this run: +strategy={parent.removeprefix('strategies.')}."
+    elif absent := [
+        o for o in options("strategy") if key.startswith(f"strategies.{o}.") and o not in known["strategies"]
+    ]:
+        remedy = f"Its strategy is not in this run: +strategy={absent[0]}."
     elif name == TARGET:  # of a strategy or a decorator that is new
         remedy = f"A plus adds it: +{key}=…."
     elif f"~{key}" in overrides and beside:
