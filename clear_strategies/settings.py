@@ -278,10 +278,12 @@ def _of_type(value: Any, hint: Any, key: str) -> Any:
     origin = get_origin(hint)
     if isinstance(value, dict) and isinstance(origin, type) and issubclass(origin, Mapping):
         return {name: _of_type(entry, get_args(hint)[1], _joined(key, name)) for name, entry in value.items()}
-    other = (
-        [tuple(value), _tuples(value)] if isinstance(value, list) else [Path(value)] if isinstance(value, str) else []
-    )
-    for candidate in (value, *other):
+    candidates = [value]
+    if isinstance(value, list):
+        candidates += [tuple(value), _tuples(value)]
+    elif isinstance(value, str):
+        candidates.append(Path(value))
+    for candidate in candidates:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", BeartypeDecorHintPep585DeprecationWarning)
@@ -308,7 +310,7 @@ def _is_of(value: Any, hint: Any) -> bool:
     if origin in (Union, types.UnionType):
         return any(_is_of(value, part) for part in parts)
     if isinstance(origin, type) and issubclass(origin, Sequence) and (len(parts) == 1 or parts[1:] == (...,)):
-        return isinstance(value, origin) and all(_is_of(entry, parts[0]) for entry in value)
+        return isinstance(value, origin) and not isinstance(value, str) and all(_is_of(x, parts[0]) for x in value)
     if isinstance(value, bool) and (hint in (int, float) or (origin is Literal and not any(value is x for x in parts))):
         return False  # to Python true is 1, to a user it is not
     return is_bearable(value, hint, conf=_NUMBERS)

@@ -112,6 +112,7 @@ REFUSED = {
         "inner": {TARGET: "builtins.type"},
     },
     "names: must be a list, each entry text or null, got [1]": {"share": 1, "names": [1]},
+    "names: must be a list, each entry text or null, got 'ab'": {"share": 1, "names": "ab"},
     "color: must be a list of 2 numbers, got [1]": {"share": 1, "color": [1]},
     "weights.x: must be a number, got 'y'": {"share": 1, "weights": {"x": "y"}},
     "weights: must be a table of names, got 3": {"share": 1, "weights": 3},
