@@ -36,7 +36,7 @@ NAMES: Final = [usage.split()[0] for usage in COMMANDS]
 _RESEARCH: Final = {
     "clear-strategies +strategy=clear data=llff data.path=FOLDER": "one run of the whole configuration",
     "clear-strategies -m +strategy=clear,gco fit.seed=0,1": "a sweep: a run for every combination",
-    "clear-strategies +strategy=clear --cfg job": "prints a run's configuration; nothing runs",
+    "clear-strategies +strategy=clear --cfg job --resolve": "prints a run's configuration; nothing runs",
     "python -m clear_strategies.report FOLDER": "a table of the runs in a folder, and report.html",
     "clear-strategies --hydra-help": "the flags of Hydra, which reads these lines",
 }

@@ -82,7 +82,7 @@ def require_composable(arguments: list[str]) -> None:
     """The configuration of a run, or of every value of a sweep, composes and makes a conductor."""
     overrides = [word for word in arguments if "=" in word or word.startswith("~")]
     flags = [word for word in arguments if word not in overrides]
-    assert set(flags) <= {"-m", "--cfg", "job"}, flags
+    assert set(flags) <= {"-m", "--cfg", "job", "--resolve"}, flags
     whole = loader().load_configuration("config", overrides, run_mode=RunMode.MULTIRUN, validate_sweep_overrides=False)
     if "-m" not in flags and whole.hydra.mode != RunMode.MULTIRUN:
         require_conductor(loader().load_configuration("config", overrides, run_mode=RunMode.RUN))
