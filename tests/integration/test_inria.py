@@ -573,6 +573,22 @@ def test_an_object_that_has_kept_render_since_before_the_setup_draws_with_the_st
     assert "4 HR renders" in caplog.text
 
 
+DECORATED = """import gaussian_renderer
+before = gaussian_renderer.render
+def decorated(*args):
+    return before(*args)
+gaussian_renderer.render = render = decorated
+"""
+
+
+def test_a_script_may_put_a_function_of_its_own_in_place_of_render(inria_host, inria_launched, caplog, monkeypatch):
+    monkeypatch.setattr(sys.modules["gaussian_renderer"], "render", inria_host.render)  # the script changes it
+    change = "def photometric", f"{DECORATED}\n\ndef photometric"
+    assert inria_launched("--iterations", "4", change=change) == 0
+    assert "4 merges" in caplog.text
+    assert "4 HR renders" in caplog.text
+
+
 def test_a_model_that_would_train_without_the_strategies_is_refused_at_its_first_rendering(
     inria_host, inria_launched, caplog, monkeypatch
 ):
