@@ -78,7 +78,8 @@ def is_real(x: Any, *shapes: tuple[int, ...]) -> bool:
 def rows_like(
     s: Strategy, hook: str, answer: Any, like: Mapping[str, Tensor], whose: str, *, finite: bool = False
 ) -> Grads:  # fmt: skip
-    """A gradient by attributes of `like`, in their types: kernels would read the memory of whole numbers as floats.
+    """A gradient by attributes of `like`, in the types in which these are merged: kernels would read the memory of whole numbers
+    as floats, and half precision would lose small gradients.
 
     Args:
         whose: these attributes, as in "of g_HR". finite: check also that its numbers are finite.
@@ -90,9 +91,11 @@ def rows_like(
             refuse(s, hook, f"attributes {whose}, {', '.join(like)}", name)
         if not is_real(x, like[name].shape):
             refuse(s, hook, f"{name} as a tensor {[*like[name].shape]}", x)
+    is_wide = {name: like[name].dtype == torch.float64 for name in answer}
+    g = Grads({name: x.to(torch.float64 if is_wide[name] else torch.float32) for name, x in answer.items()})
     if finite:
-        require_finite(s, hook, answer)
-    return Grads({name: x.to(like[name].dtype) for name, x in answer.items()})
+        require_finite(s, hook, g)
+    return g
 
 
 def _named(s: Strategy, hook: str) -> str:

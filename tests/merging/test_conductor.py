@@ -585,6 +585,14 @@ def test_an_answer_of_another_type_counts_as_its_numbers(hook, dtype):
     assert torch.equal(found.score, expected.score)
 
 
+def test_half_precision_loses_no_small_number_of_an_answer():
+    """A host's gradients are merged in float32."""
+    pull, out = torch.full((4, 3), 1e-8), {"means": torch.empty(4, 3)}
+    made, none = Conductor(answering("regularize", {"means": pull})()), Grads({"means": torch.zeros(4, 3)})
+    made.merge({"means": torch.zeros(4, 3, dtype=torch.float16)}, none, Grads(), None, 1, out)
+    assert torch.equal(out["means"], pull)
+
+
 def test_a_comparison_that_leaves_out_a_loss_keeps_its_value(drawn):
     made = answering("compare", lambda scale, image, photo, step, losses: losses(image)._replace(values={"mine": 1.0}))
     assert updated(drawn, made()).losses.keys() == {"lr", "base", "hf", "mine"}
