@@ -221,12 +221,14 @@ class AutogradShot:
 
 def of_whole_image(shot: AutogradShot) -> AutogradShot:
     """Without its drawing, if the image depends on parameters by another way, too, or was changed in place, which left no picture
-    to take cotangents of.
+    to take cotangents of. Without `drawn`, if one of them is computed from another, whose ways only a single drawing tells apart.
     """
-    own, drawing = trained(shot.params).values(), shot.drawing
-    if drawing is None or not (version(drawing.image) or reaches(shot.image, own, before=[drawing.image.grad_fn])):
-        return shot
-    return replace(shot, drawings=())
+    own, drawing, has_drawings = trained(shot.params).values(), shot.drawing, bool(shot.drawings)
+    if drawing and (version(drawing.image) or reaches(shot.image, own, before=[drawing.image.grad_fn])):
+        shot = replace(shot, drawings=())
+    if has_drawings and shot.drawing is None and reaching(shot.drawn or {}):
+        shot = replace(shot, drawn=None)
+    return shot
 
 
 def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
@@ -236,10 +238,7 @@ def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
     Args:
         warn: called if the inputs are not found, with a message and its values.
     """
-    has_drawings, shot = bool(shot.drawings), of_whole_image(shot)
-    if has_drawings and shot.drawing is None and reaching(shot.drawn or {}):  # only a drawing tells their ways apart
-        shot = replace(shot, drawn=None)
-    if shot.inputs is not None:
+    if (shot := of_whole_image(shot)).inputs is not None:
         return shot
     graph, centres = graph_of(shot.image), shot.gradient_slot.tensor
     known = {*map(id, shot.params.values()), *map(id, copied_to(centres, shot.params["means"]))}

@@ -84,7 +84,9 @@ def joint_loss(
     _require_view(conductor, view, lr=of_lr, hr=of_hr)
     _require_started(conductor)
     with without_hooks([*of_lr.leaves, *of_hr.leaves]):
-        lr = of_whole_image(lr) if isinstance(lr, AutogradShot) else lr
+        if isinstance(lr, AutogradShot):
+            lr = of_whole_image(lr)
+            require_apart({} if lr.drawing else lr.drawn or {})
         warn = _ONCE.setdefault(conductor, Once(_log.warning))
         to_others = _HrShot(hr, warn) if isinstance(hr, AutogradShot) else None
         update = conductor.update(values, lr, to_others or hr, view, t)

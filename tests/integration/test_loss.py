@@ -233,13 +233,27 @@ def test_what_reaches_the_colours_and_the_rasterizer_counts_once(found):
 
     lr, hr = render(view.lr.camera), render(view.hr.camera, host.params.get("detail"))
     if found == "by name":
-        with pytest.raises(HostError, match="means of drawn reaches sh0"):
-            joint_loss(conductor, host.params, lr, hr, view, 5)
+        for of_lr, of_hr in ((lr, replace(hr, drawn=None)), (replace(lr, drawn=None), hr)):
+            with pytest.raises(HostError, match="means of drawn reaches sh0"):
+                joint_loss(conductor, host.params, of_lr, of_hr, view, 5)
         return
     joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
     leaves = [*map(host.params.get, ("means", "opacities", "sh0")), network.weight]
     for leaf, g in zip(leaves, gradients(conductor.objective, lr, hr, view, *leaves), strict=True):
         torch.testing.assert_close(leaf.grad, g, rtol=1e-4, atol=1e-4 * float(g.abs().max()))
+
+
+def test_the_means_count_once_at_lr_where_two_drawings_make_the_picture():
+    host, conductor, view, *_ = drawn()
+    del host.params["detail"]
+    named = host.activated(sh0=host.params["sh0"] + host.params["means"][:, None])
+    with autograd.collected_drawings() as drawings:
+        first, second = (host.draw(view.lr.camera, **named) for _ in range(2))
+    lr = replace(first, image=(first.image + second.image) / 2, drawn=named, drawings=drawings)
+    joint_loss(conductor, host.params, lr, None, view, 5)[0].backward()
+    (cotangent,) = conductor.objective.lr(lr.image.detach(), view.lr.image, None).cotangents
+    means = host.params["means"]
+    torch.testing.assert_close(means.grad, *torch.autograd.grad(lr.image, means, cotangent))
 
 
 @pytest.mark.parametrize("rows", [1, 20])
