@@ -144,6 +144,7 @@ class Attached:
         )  # fmt: skip
         self.attachment: Attachment = Attachment(conductor, host, views, seed=seed)
         self.attachment.undo.callback(self._rows.remove)
+        self.attachment.undo.callback(self._added.clear)
         self._follow_optimizers()
         _MADE.add(self)
 

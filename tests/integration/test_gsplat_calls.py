@@ -119,10 +119,12 @@ def test_colours_of_the_means_count_once_where_no_single_drawing_is_the_picture(
 
 @pytest.mark.parametrize("name", [ROWS, "detail"])
 def test_params_without_what_attach_has_added_are_refused(name):
-    host, _, render = started()
+    host, clear, render = started()
     del host.splats[name]
     with pytest.raises(HostError, match=f"params have lost {name}, which attach added"):
         render()
+    clear.remove()
+    assert "means" in clear.params()
 
 
 def test_a_transform_of_torch_func_is_refused_by_name_in_a_loop():
