@@ -169,7 +169,8 @@ def _require_centres(**drawn: tuple[Shot | None, Graph]) -> None:
             continue
         raise HostError(
             f"{name} is not computed from its means2d {[*centres.shape]}, which would get no screen gradient. Pass what the "
-            "rasterizer returned, no part or copy of it: of gsplat's, slot=ScreenGradientSlot(info['means2d'], (width, height))."
+            "rasterizer returned, no part or copy of it: of gsplat's, slot=ScreenGradientSlot(info['means2d'], (width, height)). "
+            "Detach those of a rasterizer that returns none."
         )
 
 

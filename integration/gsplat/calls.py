@@ -100,7 +100,9 @@ def require_photo(call: Call, view: View, n: int) -> None:
 def of_one_camera(call: Call) -> dict[str, Any]:
     """The call of one camera with its colours by Gaussian, [N, …], also if they are given by camera, [1, N, …]."""
     colors, by_gaussian = call["colors"], 2 if call.get("sh_degree") is None else 3
-    return {**call, "colors": colors if colors.dim() == by_gaussian else colors[0]}
+    # A function of a loop's own may have a degree as its default.
+    is_by_camera = colors.dim() > by_gaussian and len(colors) == 1
+    return {**call, "colors": colors[0] if is_by_camera else colors}
 
 
 def require_own_intrinsics(Ks: Float[Tensor, "*C 3 3"], view: View) -> None:

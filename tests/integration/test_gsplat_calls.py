@@ -79,6 +79,20 @@ def test_the_colours_of_the_only_camera_have_the_gradients_of_those_by_gaussian(
         torch.testing.assert_close(found[name], g, rtol=1e-3, atol=1e-9, msg=name)
 
 
+def test_a_function_of_ones_own_may_have_the_degree_as_its_default():
+    def drawn(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree=3, **more):
+        view = viewmats, Ks, width, height
+        return gsplat_host.rasterization(means, quats, scales, opacities, colors, *view, sh_degree=sh_degree, **more)
+
+    host = Host(scene(), rasterization=drawn)
+    clear = gsplat_host.attached(host, scene(), Conductor(objective=HR_FROM_START), detail=False)
+    p, c = host.splats, scene().train[0].lr.camera
+    colors, view = torch.cat((p["sh0"], p["shN"]), 1), (c.world_to_camera[None], intrinsics(c)[None], c.width, c.height)
+    activated = p["scales"].exp(), p["opacities"].sigmoid(), colors
+    host.rasterization(p["means"], p["quats"], *activated, *view)[0].mean().backward()
+    assert clear.attachment.counts["merges"] == 1
+
+
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_a_loop_that_trains_what_follows_the_picture_may_freeze_all_gaussians(function):
     running, gain = Running(Loop(function=function)), torch.nn.Parameter(torch.ones(3))

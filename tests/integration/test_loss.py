@@ -476,6 +476,7 @@ def test_a_part_of_the_centres_and_colours_by_camera_are_refused_by_name():
     conductor.on_fit_start(3, 0)
     with pytest.raises(HostError, match=r"lr is not computed from its means2d \[20, 2\], .* slot=ScreenGradientSlot\("):
         joint_loss(conductor, host.params, replace(lr, means2d=lr.means2d[:]), hr, view, 5)
+    joint_loss(conductor, host.params, replace(lr, means2d=lr.means2d[:].detach()), hr, view, 5)
     named = host.activated(colors=torch.cat((host.params["sh0"], host.params["shN"]), 1)[None])
     with pytest.raises(HostError, match=r"colors of drawn must have a row for each of the 20 Gaussians, got \[1, 20, "):
         replace(hr, drawn={name: named[name] for name in ("means", "colors")})
