@@ -38,7 +38,7 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
     renderer, scene = _of_trainer("gaussian_renderer"), _of_trainer("scene")  # install replaces `render` of the first
     init, render = scene.Scene.__init__, training_render(renderer)
     of = scene.GaussianModel
-    scenes, models, attached, drawing = list[Any](), list[Any](), list[Any](), [render]
+    scenes, models, attached, drawing, watching = list[Any](), list[Any](), list[Any](), [render], ExitStack()
 
     @functools.wraps(init)
     def init_and_remember(loaded: Any, *args: Any, **kwargs: Any) -> None:
@@ -61,6 +61,7 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
                 launcher.save_lr(map(photo_of, scenes[-1].getTrainCameras()), save_lr)
             if settings.points == "stereo" and setup.__name__ != _SETUP:
                 raise no_stereo(f"the script calls {setup.__name__}, whose arguments belong to its own points")
+            watching.close()  # the module's function has the host's own as its __wrapped__
             attached.append(install(gaussians, scenes[-1], opt, settings))
             undo.callback(attached[-1].remove)
             drawing.append(attached[-1].wrap(drawing[-1]))  # for what has taken the module's function before, as EDGS
@@ -78,7 +79,8 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
         return drawing[-1](camera, gaussians, *args, **kwargs)
 
     with ExitStack() as undo:
-        undo.enter_context(replaced_everywhere(render, render_unless_unknown))
+        undo.enter_context(watching)
+        watching.enter_context(replaced_everywhere(render, render_unless_unknown))
         undo.enter_context(replaced_attribute(scene.Scene, "__init__", init_and_remember))
         for name in [name for name in dir(of) if name.startswith(_SETUP)]:
             undo.enter_context(replaced_attribute(of, name, installing(getattr(of, name))))

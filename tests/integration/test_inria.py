@@ -573,6 +573,13 @@ def test_an_object_that_has_kept_render_since_before_the_setup_draws_with_the_st
     assert "4 HR renders" in caplog.text
 
 
+def test_the_hosts_own_function_draws_without_the_strategies(inria_host, inria_launched, caplog):
+    own = "render.__wrapped__(camera, gaussians, pipe, background)"
+    change = "package = render(", f"unpaired = {own}\n        package = render("
+    assert inria_launched("--iterations", "4", change=change) == 0
+    assert "4 LR renders, 4 merges" in caplog.text
+
+
 DECORATED = """import gaussian_renderer
 before = gaussian_renderer.render
 def decorated(*args):
