@@ -19,7 +19,6 @@ from clear_strategies.hydra_errors import not_composed
 from clear_strategies.jobs.settings import settings_of
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.options import CONF, _ConfSource
-from clear_strategies.schedules import Ramp
 from clear_strategies.training.settings import FitSettings
 from rasterizers.geometry import SH_C0
 from tests.helpers import command_line
@@ -121,7 +120,7 @@ def test_readings_stand_beside_any_strategies_and_what_is_set_by_name_wins():
     assert (printed[1].score_by, printed[2].anchor_weights["detail"]) == ("evidence", 0)
     assert compose_module.composed(["+strategy=clear_paper"]).skips.coarse_until == 0  # where a host's is skips=hosts
     (svs,) = conductor("svs", "readings=paper", "strategies.svs.anchor_weights.detail=2").strategies
-    assert (svs.anchor_weights["detail"], svs.anchor_weights["means"], svs.looks, svs.dropout) == (2, 1, 0, Ramp())
+    assert (svs.anchor_weights["detail"], svs.anchor_weights["means"], svs.looks) == (2, 1, 0)
 
 
 def test_a_hydra_application_keeps_its_own_state():
@@ -134,14 +133,11 @@ def test_a_hydra_application_keeps_its_own_state():
 
 
 def test_clear_on_the_command_line_is_clear_in_python():
-    """The defaults have one owner, the class: strategies, objective and all numbers are the same, field by field. But hosts have
-    another dropout.
-    """
+    """The defaults have one owner, the class: strategies, objective and all numbers are the same, field by field."""
     ours = Conductor(GCO(), P2G(), SVS())
-    in_host = Conductor(GCO(), P2G(), SVS(dropout=Ramp(maximum=0.05)))
     run = settings_of(tree(composed("+strategy=clear")))
-    for theirs, strategies in ((conductor("clear"), in_host.strategies), (run.conductor(1.0), ours.strategies)):
-        assert theirs.strategies == strategies
+    for theirs in (conductor("clear"), run.conductor(1.0)):
+        assert theirs.strategies == ours.strategies
         assert theirs.objective == ours.objective
         assert theirs.statistics_from == ours.statistics_from
     kinds = {"optim": run.optim, "mip": run.mip, "cloud": run.data.cloud}
