@@ -78,8 +78,8 @@ class Hooks:
 
     def __init__(self, strategies: Sequence[Strategy], objective: Objective) -> None:
         for given in strategies:
-            made = isinstance(given, Strategy) and hasattr(given, "state")  # an __init__ of one's own makes no state
-            if not made:
+            # An __init__ of one's own makes no state.
+            if not (isinstance(given, Strategy) and hasattr(given, "state")):
                 raise SettingError(
                     "a conductor takes strategies one by one, made by the __init__ of their dataclass, as "
                     f"Conductor(GCO(), P2G()), got {given!r:.80}."

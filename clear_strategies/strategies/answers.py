@@ -91,8 +91,7 @@ def rows_like(
             refuse(s, hook, f"attributes {whose}, {', '.join(like)}", name)
         if not is_real(x, like[name].shape):
             refuse(s, hook, f"{name} as a tensor {[*like[name].shape]}", x)
-    is_wide = {name: like[name].dtype == torch.float64 for name in answer}
-    g = Grads({name: x.to(torch.float64 if is_wide[name] else torch.float32) for name, x in answer.items()})
+    g = Grads({name: x.double() if like[name].dtype == torch.float64 else x.float() for name, x in answer.items()})
     if finite:
         require_finite(s, hook, g)
     return g
