@@ -14,10 +14,11 @@ import re
 import shlex
 import signal
 import sys
+from argparse import ArgumentParser
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -44,6 +45,19 @@ FAILED: Final = "failed.txt"
 """In the folder of a sweep's job: why it failed; beside the folder, behind its name, where that holds a finished run."""
 
 
+@contextmanager
+def help_unchecked() -> Iterator[None]:
+    """A scope in which argparse does not check the help of flags. Python 3.14 does where a flag is added, and refuses Hydra 1.3's
+    `--shell-completion`, whose help becomes a string only when it is shown.
+    """
+    ArgumentParser._check_help = lambda self, action: None  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        del ArgumentParser._check_help  # type: ignore[attr-defined]
+
+
+@help_unchecked()
 def main(overrides: Sequence[str] | None = None) -> None:
     """Hydra's command line, and `-v`.
 

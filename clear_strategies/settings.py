@@ -28,6 +28,7 @@ from beartype.door import is_bearable
 from beartype.roar import BeartypeDecorHintPep585DeprecationWarning, BeartypeException
 
 from clear_strategies.errors import DataError, SettingError, one_line
+from clear_strategies.signatures import signature_of
 from rasterizers.interface import BackendUnavailable
 
 TARGET: Final = "_target_"
@@ -187,7 +188,7 @@ def _located(target: Any) -> Callable[..., Any]:
         raise ImportError("it is no dotted name")
     function = getattr(importlib.import_module(module), name)
     try:
-        inspect.signature(function)
+        signature_of(function)
     except (ValueError, TypeError) as error:  # no function, or one that is built in
         raise ImportError(f"it is no class or function whose parameters are known: {one_line(error)}") from error
     return typing.cast("Callable[..., Any]", function)
@@ -202,7 +203,7 @@ def has_parameter(target: str, name: str) -> bool:
 
 
 def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
-    return {name: p for name, p in inspect.signature(function).parameters.items() if not name.startswith("_")}
+    return {name: p for name, p in signature_of(function).parameters.items() if not name.startswith("_")}
 
 
 def _hints(function: Callable[..., Any]) -> dict[str, Any]:

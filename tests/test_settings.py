@@ -1,6 +1,7 @@
 """Settings as plain values: defaults filled in from signatures, and everything checked before a class is called."""
 
 import random
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -153,3 +154,22 @@ def test_what_a_decorator_refuses_is_named_by_the_file_of_the_class(tmp_path, mo
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(SettingError, match=r"of_her_own\.py:2: ValueError: mutable default .* Correct that file"):
         build({TARGET: "of_her_own.Mine"}, "it")
+
+
+@pytest.mark.skipif(sys.version_info < (3, 14), reason="Python evaluates annotations where they are written")
+def test_annotations_may_name_what_only_type_checkers_import(tmp_path, monkeypatch):
+    (tmp_path / "own.py").write_text(
+        "from dataclasses import dataclass\n"
+        "from typing import TYPE_CHECKING\n"
+        "from clear_strategies import Strategy\n"
+        "if TYPE_CHECKING:\n"
+        "    from pathlib import Path\n"
+        "@dataclass(frozen=True)\n"
+        "class Own(Strategy):\n"
+        "    where: Path | None = None\n"
+        "    factor: float = 1.0\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    node = {TARGET: "own.Own", "factor": 2.0}
+    assert with_defaults(node)["where"] is None
+    assert build(node, "strategies.own").factor == 2.0

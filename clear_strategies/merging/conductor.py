@@ -5,7 +5,6 @@ It is the same in every trainer. The order of an iteration is that of `Conductor
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
@@ -38,6 +37,7 @@ from clear_strategies.merging.iteration import (
 from clear_strategies.merging.logs import IterationLogs
 from clear_strategies.merging.objective import Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
+from clear_strategies.signatures import signature_of
 from clear_strategies.strategies.base import RunFacts, Scale, Strategy
 from rasterizers.guards import iteration
 from rasterizers.interface import Color
@@ -386,7 +386,7 @@ def _vjp(
 @cache
 def _sums(kind: Any) -> bool:
     """Whether `vjp` of this class of shots takes `weight`, which one's own may lack."""
-    return "weight" in inspect.signature(kind.vjp).parameters
+    return "weight" in signature_of(kind.vjp).parameters
 
 
 def _require_size(view: View, scale: Scale, render: Tensor) -> None:

@@ -26,6 +26,7 @@ from clear_strategies.core.step import Losses, Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.errors import AnswerError
 from clear_strategies.kernels import reconcile
+from clear_strategies.signatures import annotations_of
 from rasterizers.interface import Camera, Color, Splats
 from rasterizers.native import empty_for
 
@@ -87,7 +88,7 @@ class Strategy:
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
-        if taken := _OWN_NAMES & inspect.get_annotations(cls).keys():
+        if taken := _OWN_NAMES & annotations_of(cls).keys():
             raise TypeError(
                 f"{cls.__name__}: a setting must not be called {min(taken)}, which every strategy has already."
             )

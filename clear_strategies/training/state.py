@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from inspect import signature
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,6 +20,7 @@ from clear_strategies.data.scene import Scene
 from clear_strategies.errors import AnswerError, DataError, DivergedError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.skips import Plateau
+from clear_strategies.signatures import signature_of
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
@@ -62,9 +62,9 @@ def _means(layers: Float[Tensor, "H W C"]) -> Float[Tensor, "C h w"]:
 def _densifier_of(owner: Strategy | DensifierSettings, *arguments: Any) -> Any:
     """Settings of an older version, say, take other arguments."""
     try:
-        signature(owner.densifier).bind(*arguments)
+        signature_of(owner.densifier).bind(*arguments)
     except TypeError as error:
-        rule = f"must take (field, views, seed), got {signature(owner.densifier)}"
+        rule = f"must take (field, views, seed), got {signature_of(owner.densifier)}"
         raise AnswerError(f"{type(owner).__name__}.densifier() {rule}. See Strategy.densifier.") from error
     return owner.densifier(*arguments)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import inspect
 import logging
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -17,6 +16,7 @@ from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
+from clear_strategies.signatures import signature_of
 from integration.announcement import Once
 from integration.attachment import Attachment
 from integration.autograd_shot import HostOutput, Target
@@ -169,7 +169,7 @@ class Attached:
                 "this rasterization is wrapped already; remove() the attachment that wrapped it first, or "
                 "wrap rasterization.__wrapped__."
             )
-        signature = inspect.signature(rasterization)
+        signature = signature_of(rasterization)
         var_keyword = [name for name, p in signature.parameters.items() if p.kind is p.VAR_KEYWORD]
         if missing := {"means", "opacities", "colors", "viewmats", "Ks", "width", "height"} - {*signature.parameters}:
             raise HostError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import inspect
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -15,6 +14,7 @@ from torch import Tensor
 from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
+from clear_strategies.signatures import signature_of
 from integration.announcement import Once
 from integration.attachment import Attachment
 from integration.autograd_shot import HostOutput, Target
@@ -132,7 +132,7 @@ class Attached:
 
     def wrap(self, render: Callable[..., Any]) -> Callable[..., Any]:
         """`render` that renders training cameras at both scales, and shows f_base + f_det anywhere else."""
-        signature = inspect.signature(render)
+        signature = signature_of(render)
 
         @functools.wraps(render)
         @uncompiled

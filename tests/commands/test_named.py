@@ -1,5 +1,6 @@
 """What the first word of a command line does: a subcommand, help, Hydra, or an error that names what was meant; and `doctor`."""
 
+import argparse
 import os
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from functools import partial
 from importlib import metadata
 
 import pytest
+from hydra._internal.utils import get_args_parser
 
 import rasterizers
 from clear_strategies import hydra_app, run
@@ -43,6 +45,29 @@ def test_overrides_and_flags_are_hydras(first, monkeypatch):
     monkeypatch.setattr(hydra_app, "main", lambda: called.append(first))
     run.named([first, "more"])()
     assert called == [first]
+
+
+def test_flags_are_those_of_hydra_where_argparse_checks_their_help(monkeypatch):
+    """As Python 3.14's does, which refuses Hydra 1.3."""
+    add = argparse._ActionsContainer.add_argument
+
+    def check(self, action):
+        if action.help and not isinstance(action.help, str):
+            raise ValueError("badly formed help string")
+
+    def checked(self, *names, **settings):
+        action = add(self, *names, **settings)
+        self._check_help(action)
+        return action
+
+    monkeypatch.setattr(argparse._ActionsContainer, "_check_help", check, raising=False)
+    monkeypatch.setattr(argparse._ActionsContainer, "add_argument", checked)
+    with pytest.raises(ValueError, match="badly formed help string"):
+        get_args_parser()
+    with hydra_app.help_unchecked():
+        assert get_args_parser().parse_args(["-m", "a=1,2"]).multirun
+    with pytest.raises(ValueError, match="badly formed help string"):
+        argparse.ArgumentParser().add_argument("--own", help=object())
 
 
 @pytest.mark.parametrize(
