@@ -338,7 +338,7 @@ def _declaring(built: Any, field: str) -> Any:
     """The class that declares the field: a base may be another library's, whose own pages describe its fields."""
     if not inspect.isclass(built):
         return built
-    return next((base for base in built.__mro__ if field in vars(base).get("__annotations__", {})), built)
+    return next((base for base in built.__mro__ if field in inspect.get_annotations(base)), built)
 
 
 def _built(

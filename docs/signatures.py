@@ -38,6 +38,8 @@ def hints(built: Any) -> dict[str, str]:
 
 
 def _type(annotation: Any) -> str:
+    if typing.get_origin(annotation) is typing.Union:  # written alike by each version of Python
+        return " | ".join("None" if part is type(None) else _type(part) for part in typing.get_args(annotation))
     if isinstance(annotation, type):
         return annotation.__name__
     text = annotation if isinstance(annotation, str) else repr(annotation)
