@@ -38,7 +38,7 @@ def require_stored(s: Strategy, params: Mapping[str, Tensor]) -> None:
                     f"{entry} must be a tensor with a row for each Gaussian, {min(n, default=0)}, or without dimensions, got "
                     f"{_shown(x)}. Other tensors belong in run_state, and what can be computed again in cache."
                 )
-            if not isinstance(x, Tensor) or (where == "run_state" and x.requires_grad):
+            if not isinstance(x, Tensor) or not _is_stored(x) or (where == "run_state" and x.requires_grad):
                 raise AnswerError(
                     f"{entry} must be a tensor that requires no gradient, got {_shown(x)}. Hooks turn autograd on for a copy, "
                     "x.detach().requires_grad_()."
@@ -71,8 +71,12 @@ def require_not_negative(s: Strategy, hook: str, name: str, x: Tensor) -> None:
 
 
 def is_real(x: Any, *shapes: tuple[int, ...]) -> bool:
-    """Return True if it is a tensor of one of the shapes. A conversion of complex numbers drops their imaginary part."""
-    return isinstance(x, Tensor) and x.shape in shapes and not x.is_complex()
+    """Return True if it is a dense tensor of one of the shapes. A conversion of complex numbers drops their imaginary part."""
+    return isinstance(x, Tensor) and x.shape in shapes and not x.is_complex() and _is_stored(x)
+
+
+def _is_stored(x: Tensor) -> bool:
+    return x.layout is torch.strided and not x.is_meta
 
 
 def rows_like(
@@ -107,5 +111,8 @@ def refuse(s: Strategy, hook: str, rule: str, found: Any) -> NoReturn:
 
 def _shown(found: Any) -> str:
     if isinstance(found, Tensor):
-        return f"a {'complex ' if found.is_complex() else ''}tensor {[*found.shape]}"
+        kind = "complex " if found.is_complex() else "meta " if found.is_meta else ""
+        if found.layout is not torch.strided:
+            return f"a tensor {[*found.shape]} of layout {found.layout}; convert it by to_dense()"
+        return f"a {kind}tensor {[*found.shape]}{', which has no numbers' * found.is_meta}"
     return f"{found!r:.80}"

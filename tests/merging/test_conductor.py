@@ -202,6 +202,15 @@ ANSWERS = {
         "reconcile", lambda p, step: Weights(keep=p.dot[:, 0] + 1j), "keep is a number or .*, got a complex tensor \\[30\\]"
     ),
     "gate, complex": ("gate", lambda t, n: torch.ones(n) + 0j, "must give a tensor .*, got a complex tensor \\[30\\]"),
+    "gate, sparse": ("gate", lambda t, n: torch.ones(n).to_sparse(), "got a tensor \\[30\\] of .*sparse_coo; .* to_dense"),
+    "gate, meta": ("gate", lambda t, n: torch.ones(n, device="meta"), "got a meta tensor \\[30\\], which has no numbers"),
+    "keep, sparse": (
+        "reconcile", lambda p, step: Weights(keep=p.dot.to_sparse()), "keep is a number or .*, got a tensor .* to_dense"
+    ),
+    "correct, sparse": (
+        "correct", lambda lr, hr, step: {"means": hr["means"].to_sparse()}, "must give means as a tensor .* to_dense"
+    ),
+    "regularize, meta": ("regularize", lambda p, t: {"means": p["means"].to("meta")}, "must give means as .*, got a meta tensor"),
     "route NaN": ("route", float("nan"), "must give finite numbers, but m is nan"),
     "correct": ("correct", None, "must give Grads, or a mapping from attributes to tensors, got None"),
     "correct, weights": ("correct", Weights(), "must give Grads, or a mapping"),
@@ -508,6 +517,7 @@ def test_a_number_of_the_run_is_state_as_rows_are():
         ("run_state", lambda p: {3: torch.zeros(2)}, "3.* must have a text as its key, which is what checkpoints keep"),
         ("run_state", lambda p: {"x": 0.5}, "'x'.* must be a tensor that requires no gradient, got 0.5"),
         ("run_state", lambda p: {"x": p[:2].requires_grad_()}, "'x'.* must be a tensor that requires no gradient"),
+        ("state", lambda p: {"x": p.to_sparse()}, "'x'.* must be a tensor .*, got a tensor .* convert it by to_dense"),
     ],
 )  # fmt: skip
 def test_what_a_checkpoint_could_not_give_back_is_refused(where, stored, message):
