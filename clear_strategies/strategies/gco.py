@@ -128,7 +128,13 @@ class GCO(Strategy):
                 "Set strategies.gco.groups.", ", ".join(self.groups), ", ".join(p.names),
             )  # fmt: skip
             return
-        if not (has_evidence or self.keep_length or self.drop):
+        keeps_length = self.keep_length and not (has_evidence or self.drop)
+        if keeps_length and groups == ["opacities"]:
+            self._log_once(
+                logging.WARNING, "GCO has no effect: an opacity is one number, and what is opposite keeps its length without "
+                "evidence. Set strategies.gco.keep_length=false, or add p2g.",
+            )  # fmt: skip
+        elif not (has_evidence or keeps_length or self.drop):
             self._log_once(
                 logging.INFO, "GCO corrects without evidence: LR prevails in every conflict, which costs PSNR if most of the SR "
                 "detail is right. Set strategies.gco.keep_length=true, or add p2g.",

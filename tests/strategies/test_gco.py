@@ -56,6 +56,20 @@ def test_without_evidence_it_says_once_that_lr_prevails(caplog):
     ] * 2
 
 
+@pytest.mark.parametrize("whole", [False, True])
+def test_opacities_alone_are_told_to_pass_without_evidence(whole, caplog):
+    gco, (lr, hr) = GCO(groups=["opacities"], whole=whole), random_pair(0)
+    for _ in range(2):
+        torch.testing.assert_close(gco.correct(lr, hr)["opacities"], hr["opacities"])
+    (told,) = caplog.messages
+    assert "GCO has no effect: an opacity is one number" in told
+    GCO(groups=["opacities"], whole=whole, drop=True).correct(lr, hr)
+    GCO(groups=["opacities"], whole=whole, keep_length=False).correct(lr, hr)
+    GCO(groups=["opacities", "sh0"], whole=whole).correct(lr, hr)
+    gco.correct(lr, hr, toy.step(evidence=Evidence(torch.zeros(200), torch.ones(200))))
+    assert caplog.messages == [told]
+
+
 @pytest.mark.parametrize("group", CONFLICT_GROUPS)
 def test_without_evidence_what_is_turned_keeps_its_length_and_with_evidence_it_is_the_papers(group):
     lr, hr = random_pair(3)
