@@ -22,6 +22,7 @@ from clear_strategies.errors import HostError
 
 _log = logging.getLogger(__name__)
 
+_OF_SAM: Final = 2  # passes over a view before the first step, by which steps by hand are told from those of SAM
 _PATIENCE: Final = 10  # iterations with extra views, one after the other, of which none made a step, before a warning
 
 
@@ -43,6 +44,7 @@ class HostSteps:
         self._hooked: list[torch.optim.Optimizer] = []
         self._stepped: set[torch.optim.Optimizer] = set()  # in this step of the host
         self._has_merged = False  # since the last step
+        self._by_hand: int | None = 0  # merges before the first step; None: an optimizer has stepped
         self._extra: list[Grads] = []
         self._rendered: Mapping[str, Tensor] = {}  # the leaves of `_extra`
         self._steps_on_extra = False  # an optimizer is stepping on an extra view
@@ -68,11 +70,15 @@ class HostSteps:
         """Called when gradients were merged: the next step of any optimizer begins a step of the host."""
         self._stepped.clear()
         self._has_merged = True
+        if self._by_hand is not None:
+            self._by_hand += 1
 
     @property
     def are_known(self) -> bool:
-        """True if the host has optimizers whose steps can be seen."""
-        return bool(self._hooked)
+        """True if the host has optimizers whose steps can be seen. A loop that steps by hand has none but that of f_det, which it
+        does not step.
+        """
+        return bool(self._hooked) and (self._by_hand is None or self._by_hand < _OF_SAM)
 
     @property
     def has_extra_views(self) -> bool:
@@ -119,7 +125,7 @@ class HostSteps:
         self._before()
         if optimizer in self._stepped or self._stepped.isdisjoint(self._hooked):  # all may have been made anew
             self._stepped.clear()
-        begins = not self._stepped
+        begins, self._by_hand = not self._stepped, None
         self._stepped.add(optimizer)
         if begins:
             has_merged, self._has_merged = self._has_merged, False

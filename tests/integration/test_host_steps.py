@@ -405,6 +405,19 @@ def test_a_step_of_sam_is_one_iteration_and_one_of_summed_views_is_several():
     torch.testing.assert_close(found, 4 * expected)
 
 
+@pytest.mark.parametrize("optimizers", [True, False])
+def test_a_loop_that_steps_by_hand_over_one_view_goes_on(optimizers):
+    """The first pass alone may be that of SAM, whose step is still to come."""
+    host = Host(toy.scene(20))
+    host.optimizers = host.optimizers if optimizers else {}
+    host, clear, render = started(host=host)
+    for _ in range(6):
+        render().mean().backward()
+        for name, p in host.splats.items():
+            p.grad = p.grad if name == "detail" else None
+    assert clear.attachment.t == 5
+
+
 def test_a_loop_resumes_between_the_passes_of_a_step_with_the_same_bits():
     def trained(pauses):
         loop = host, clear, render = started(toy.ShowsDark(), accumulation=2)
