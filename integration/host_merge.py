@@ -20,6 +20,7 @@ from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
 from clear_strategies.merging.replay import merging_strategies
+from integration.announcement import Once
 from integration.autograd_shot import AutogradShot, trained
 from integration.densification import ScoreScaler, score_for_host
 from integration.detail import Fading
@@ -55,6 +56,7 @@ class HostMerge:
         merged: Callable[[Pending, Mapping[str, Number] | None, Mapping[str, Tensor]], None],
     ) -> None:  # fmt: skip
         self._conductor, self._host, self._counts, self._merged = conductor, host, counts, merged
+        self._warn_once = Once(_log.warning)
         self.pending: Pending | None = None
         self.scaler = None if host.threshold is None else ScoreScaler(host.threshold)
         self.fading = Fading(conductor.detail)
@@ -135,7 +137,11 @@ class HostMerge:
                     "rasterization(sparse_grad=False)."
                 )
             if p.grad is not None and p.grad.requires_grad:
-                p.grad = p.grad.detach()  # create_graph=True: the merged gradient has no graph
+                p.grad = p.grad.detach()
+                self._warn_once(
+                    "backward(create_graph=True) leaves no graph behind .grad, which holds the merged gradient: a gradient "
+                    "penalty that is computed from .grad has no effect. Compute it by torch.autograd.grad(…, create_graph=True)."
+                )
         detail = done.params.get("detail") if first else None
         if detail is not None and not detail.requires_grad:
             detail = None

@@ -418,6 +418,14 @@ def test_a_loop_that_steps_by_hand_over_one_view_goes_on(optimizers):
     assert clear.attachment.t == 5
 
 
+def test_a_gradient_penalty_from_the_merged_gradient_is_told_once_to_have_no_effect(caplog):
+    host, _, render = started()
+    for _ in range(2):
+        render().mean().backward(create_graph=True)
+        assert not any(g.requires_grad for g in host.gradients().values())
+    assert caplog.text.count("a gradient penalty that is computed from .grad has no effect") == 1
+
+
 def test_a_loop_resumes_between_the_passes_of_a_step_with_the_same_bits():
     def trained(pauses):
         loop = host, clear, render = started(toy.ShowsDark(), accumulation=2)
