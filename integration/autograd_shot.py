@@ -19,13 +19,13 @@ from integration.graph import (
     Edge,
     Graph,
     Inputs,
+    centres_drawn,
     copied_to,
     edge_of,
     graph_of,
     has_gradient,
     inputs_of,
     joined,
-    reaches,
     reaching,
     without_hooks,
 )
@@ -101,6 +101,7 @@ class AutogradShot:
         drawings: of this image by this package's rasterizers; a single one takes all cotangents in one pass.
         mask: the image is a drawing outside of any graph, times this mask.
         found: the inputs of another rasterizer, which `joint_loss` and hosts set.
+        around: the camera and the background beside `drawn`, in the graph; what they are computed from learns from LR alone.
 
     Raises:
         HostError: one of `drawn` has no row for each Gaussian.
@@ -115,6 +116,7 @@ class AutogradShot:
     drawings: Sequence[Drawing] = ()
     mask: Float[Tensor, "H W 1"] | None = None
     found: Inputs | None = None
+    around: Sequence[Tensor] = ()
 
     def __post_init__(self) -> None:
         for name, x in (self.drawn or {}).items():
@@ -220,15 +222,23 @@ class AutogradShot:
 
 
 def of_whole_image(shot: AutogradShot) -> AutogradShot:
-    """Without its drawing, if the image depends on parameters by another way, too, or was changed in place, which left no picture
-    to take cotangents of. Without `drawn`, if one of them is computed from another, whose ways only a single drawing tells apart.
+    """Without its drawing or `drawn`, if the image depends on parameters by another way, too. Also without its drawing, if the
+    image was changed in place, which left no picture to take cotangents of; and without `drawn`, if one of them is computed from
+    another, whose ways only a single drawing tells apart.
     """
     own, drawing, has_drawings = trained(shot.params).values(), shot.drawing, bool(shot.drawings)
-    if drawing and (version(drawing.image) or reaches(shot.image, own, before=[drawing.image.grad_fn])):
+    if drawing and (version(drawing.image) or graph_of(shot.image, before=[drawing.image.grad_fn]).reaches(own)):
         shot = replace(shot, drawings=())
-    if has_drawings and shot.drawing is None and reaching(shot.drawn or {}):
-        shot = replace(shot, drawn=None)
-    return shot
+    if shot.drawing or shot.drawn is None:
+        return shot
+    is_part = _beside(shot).reaches(own) or (has_drawings and reaching(shot.drawn))
+    return replace(shot, drawn=None) if is_part else shot
+
+
+def _beside(shot: AutogradShot) -> Graph:
+    """The graph of the image around what is known to be drawn."""
+    drawn = *(shot.drawn or {}).values(), *shot.around
+    return graph_of(shot.image, before=[edge_of(x).node for x in drawn if x.requires_grad])
 
 
 def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
@@ -238,10 +248,10 @@ def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
     Args:
         warn: called if the inputs are not found, with a message and its values.
     """
-    if (shot := of_whole_image(shot)).inputs is not None:
+    if (shot := of_whole_image(shot)).drawing is not None:
         return shot
     graph, centres = graph_of(shot.image), shot.gradient_slot.tensor
-    known = {*map(id, shot.params.values()), *map(id, copied_to(centres, shot.params["means"]))}
+    known = {*map(id, [*shot.params.values(), *copied_to(centres, shot.params["means"]), *centres_drawn(graph)])}
 
     def others(behind: Graph) -> list[Tensor]:
         return [leaf for leaf in behind.leaves if id(leaf) not in known]
@@ -249,12 +259,13 @@ def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
     def names(leaves: Sequence[Tensor]) -> str:
         return ", ".join(f"{leaf.dtype} {[*leaf.shape]}" for leaf in leaves[:3])
 
-    if not (found := others(graph)):
+    if not (found := others(graph)) or (shot.drawn is not None and not others(_beside(shot))):
         return shot
     if (inputs := inputs_of(shot.image, graph, centres, shot.params, found)) is None:
         warn(
             "the loop trains %d tensors beside the Gaussians (%s), which learn from LR alone: the inputs of the rasterizer were "
-            "not found, or their rows are not those of the parameters. Name them by AutogradShot(drawn=…).",
+            "not found, or their rows are not those of the parameters. Name them by AutogradShot(drawn=…), or compute them "
+            "outside of the function that attach has wrapped.",
             len(found), names(found),
         )  # fmt: skip
         return shot
@@ -354,7 +365,7 @@ class HostOutput:
 
     Args:
         marks: tensors that every backward pass over the rendering reaches before any parameter; a drawing by this package's
-            rasterizers needs none. The host must not change them in place.
+            rasterizers needs none. Of a view pass the base, whose node stays if the host writes to the view in place.
         returned: the return value of the host's render function.
     """
 

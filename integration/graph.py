@@ -29,37 +29,31 @@ class Graph(NamedTuple):
 
     Args:
         nodes: of autograd.
-        drawn: what this package's rasterizers drew for them.
+        drawn: what this package's rasterizers drew for them, by its node.
     """
 
     nodes: set[Any]
     leaves: list[Tensor]
-    drawn: list[Drawing]
+    drawn: dict[Any, Drawing]
 
     def reaches(self, leaves: Iterable[Tensor]) -> bool:
         """Whether one of these is among its leaves."""
         return not {*map(id, leaves)}.isdisjoint(map(id, self.leaves))
 
 
-def graph_of(*edges: Edge) -> Graph:
-    """The graph behind tensors, in one walk. A leaf is its own."""
-    graph = Graph(set(), [], [])
-    for node in _behind(edges):
+def graph_of(*edges: Edge, before: Iterable[Any] = ()) -> Graph:
+    """The graph behind tensors, in one walk around the nodes `before`. A leaf is its own."""
+    graph = Graph(set(), [], {})
+    for node in _behind(edges, before):
         graph.nodes.add(node)
         if (leaf := leaf_of(node)) is not None:
             graph.leaves.append(leaf)
         elif isinstance(drawing := getattr(node, "drawing", None), Drawing):
-            graph.drawn.append(drawing)
+            graph.drawn[node] = drawing
     return graph
 
 
-def reaches(x: Tensor, leaves: Iterable[Tensor], *, before: Iterable[Any]) -> bool:
-    """Whether a tensor is computed from one of these leaves by a way around the nodes `before`."""
-    known = {*map(id, leaves)}
-    return any(id(leaf_of(node)) in known for node in _behind([x], before))
-
-
-def _behind(edges: Iterable[Edge], before: Iterable[Any] = ()) -> Iterator[Any]:
+def _behind(edges: Iterable[Edge], before: Iterable[Any]) -> Iterator[Any]:
     seen: set[Any] = {*before}
     nodes: list[Any] = [edge_of(x).node for x in edges if has_gradient(x)]
     while nodes:
@@ -113,6 +107,14 @@ class Inputs:
             yield found
 
 
+def centres_drawn(graph: Graph) -> Iterator[Tensor]:
+    """The leaves that get the screen gradients of what this package's rasterizers drew."""
+    for node, drawing in graph.drawn.items():
+        inputs = sum(x is not None for x in drawing.inputs)  # the last arguments of the node, after the centres
+        behind = graph_of(GradientEdge(*node.next_functions[-1 - inputs])).leaves
+        yield from (x for x in behind if x.shape[-1:] == (2,))
+
+
 def copied_to(centres: Tensor, means: Tensor) -> list[Tensor]:
     """The leaf whose copy a tensor is, as hosts make one for the screen gradient (`torch.zeros(n, 3, requires_grad=True) + 0`);
     itself if it is a leaf. No optimizer steps it, unlike other leaves from which centres are computed, with those of `means`.
@@ -126,27 +128,31 @@ def copied_to(centres: Tensor, means: Tensor) -> list[Tensor]:
 def inputs_of(
     image: Tensor, graph: Graph, centres: Tensor, params: Mapping[str, Tensor], others: Iterable[Tensor]
 ) -> Inputs | None:  # fmt: skip
-    """The inputs of the rasterizer that drew `image`; None: it is no single node, or its rows are not those of the parameters.
+    """The inputs of the rasterizer that drew `image`; None: it is no single node and none of this package's, or its rows are not
+    those of the parameters.
 
     Args:
         graph: of the image.
-        centres: through which it passes the screen gradient.
+        centres: through which another package's passes the screen gradient.
         params: raw parameters by gsplat's names, with N rows. others: leaves that are trained beside them.
     """
-    if not centres.requires_grad or not image.requires_grad:
-        return None
-    probe, n = edge_of(centres), len(params["means"])
+    n = len(params["means"])
     own = [p for name, p in params.items() if name != "detail"]
     readers = dict[Any, set[Any]]()
     for x in graph.nodes:
         for behind, _ in x.next_functions:
             readers.setdefault(behind, set()).add(x)
-    nodes = {x for x in readers.get(probe.node, ()) if (probe.node, probe.output_nr) in x.next_functions}
+    nodes = {*graph.drawn}
+    if not nodes and centres.requires_grad:
+        probe = edge_of(centres)
+        nodes = {x for x in readers.get(probe.node, ()) if (probe.node, probe.output_nr) in x.next_functions}
     steps = 0
-    while nodes and reaches(image, own, before=nodes):  # on to what is computed from these
+    while nodes and graph_of(image, before=nodes).reaches(own):  # on to what is computed from these
         nodes, steps = {reader for x in nodes for reader in readers.get(x, ())}, steps + 1
         if max(steps, len(nodes)) > _MOST:
             return None
+    if not nodes:
+        return None
     inputs = {
         _name(i, j): GradientEdge(behind, nr)
         for i, node in enumerate(nodes)
@@ -159,7 +165,7 @@ def inputs_of(
     if of_own - has_rows or any(not found.nodes.isdisjoint(nodes) for found in graphs.values()):
         return None
     edges = {name: inputs[name] for name in has_rows if name in of_own or graphs[name].reaches(others)}
-    beside = {id(leaf_of(node)) for node in _behind([image], nodes)}
+    beside = {*map(id, graph_of(image, before=nodes).leaves)}
     shared = [leaf for leaf in graph_of(*edges.values()).leaves if id(leaf) in beside]
     near_first = sorted(of_own, key=lambda name: len(graphs[name].nodes))  # a network may lie between the others
     pairs = [(inputs[name], p) for name in near_first for p in own if graphs[name].reaches([p])]

@@ -196,7 +196,7 @@ def _require_view(conductor: Conductor, view: View, **graphs: Graph) -> None:
         return [v for v, is_same in zip(views, same.flatten(1).all(1).tolist(), strict=True) if is_same]
 
     for name, graph in graphs.items():
-        for camera in (drawn.camera for drawn in graph.drawn):
+        for camera in (drawn.camera for drawn in graph.drawn.values()):
             if not with_pose(camera, [view]) and (drawn := with_pose(camera, conductor.views)):
                 raise ValueError(
                     f"{name} must be drawn by the camera of its view {view.name}, got that of {drawn[0].name}. Pass its view."

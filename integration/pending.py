@@ -18,6 +18,7 @@ from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.iteration import HrSide
 from integration.autograd_shot import HostOutput, OfOthers
 from integration.colours import are_accumulated, are_joined
+from integration.graph import edge_of
 from rasterizers.differentiable import TakeColours
 from rasterizers.native import empty_for
 from rasterizers.torch_internals import current_pass, hooks_after_accumulation, hooks_on_gradient, version
@@ -172,7 +173,7 @@ class Pending:
         for drawing in self.output.shot.drawings:
             drawing.hook.reached = called
 
-        def on_gradient(_: Tensor) -> None:  # returns None, so that the gradient stays
+        def on_gradient(_: Sequence[Tensor]) -> None:  # returns None, so that the gradient stays
             called()
 
         if any(mark.is_leaf and mark.requires_grad for mark in self.output.marks):
@@ -181,7 +182,7 @@ class Pending:
                 "gets, e.g. the image."
             )
         for mark in filter(attrgetter("requires_grad"), self.output.marks):
-            mark.register_hook(on_gradient)  # type: ignore[no-untyped-call]
+            edge_of(mark).node.register_prehook(on_gradient)  # stays if the host writes to the mark in place
         centres = self.output.shot.gradient_slot.tensor
         if to_screen and centres.requires_grad:
 

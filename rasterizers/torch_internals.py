@@ -52,6 +52,13 @@ def of_gradient(edge: torch.autograd.graph.GradientEdge) -> tuple[torch.Size, to
     return torch.Size(metadata.shape), metadata.dtype
 
 
+def base_of(x: Tensor) -> Tensor:
+    """The tensor whose memory a view shows; itself if it is none. A view that is written in place gets another node, that of the
+    tensor stays in the graph.
+    """
+    return x if x._base is None else x._base
+
+
 def is_cat(node: Any) -> bool:
     """Whether a node is that of `torch.cat`."""
     return bool(node.name() == "CatBackward0")

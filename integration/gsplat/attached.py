@@ -289,8 +289,8 @@ class Attached:
                 return calls.drawable(own, call, params, camera)
             if camera is not None:
                 call = calls.seen_by(call, camera)
-            call, aliases = (call, ()) if is_ours else calls.aliased(call)
-            return calls.host_output(rasterization, call, params, gate, aliases if target == "lr" else ())
+            call, aliases = (call, None) if is_ours else calls.aliased(call)
+            return calls.host_output(rasterization, call, params, gate, aliases if target == "lr" else None)
 
         return render_at
 

@@ -23,6 +23,7 @@ from rasterizers.as_gsplat import cameras_of
 from rasterizers.differentiable import collected_drawings
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Rasterizer
+from rasterizers.torch_internals import base_of
 
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 Call = Mapping[str, Any]
@@ -187,9 +188,12 @@ def drawable(rasterizer: Rasterizer, call: Call, params: Mapping[str, Tensor], c
 
 def host_output(
     rasterization: Rasterization, call: Call, params: Mapping[str, Tensor], gate: Float[Tensor, " N"] | None,
-    marks: Sequence[Tensor] = (),
+    marks: Sequence[Tensor] | None = None,
 ) -> HostOutput:  # fmt: skip
     """Render. Gaussians that the gate drops are marked as invisible in `info`.
+
+    Args:
+        marks: more of the `HostOutput`'s than the picture; None: it needs none.
 
     Raises:
         HostError: the function does not return what gsplat's does.
@@ -223,5 +227,8 @@ def host_output(
     names = ("means", "quats", "scales", "opacities", "colors")
     drawn = {name: call[name] for name in names if call.get(name) is not None}
     slot = ScreenGradientSlot(info["means2d"], size, rows=rows)
-    shot = AutogradShot(image, means2d, visible, params, slot, drawn, drawings)
-    return HostOutput(shot, (renders, alphas, info), marks)
+    around = [call[name] for name in ("viewmats", "Ks", "backgrounds") if call.get(name) is not None]
+    shot = AutogradShot(image, means2d, visible, params, slot, drawn, drawings, around=around)
+    if marks is not None:  # the function may also read parameters that it is not given
+        marks = [*marks, *(base_of(x) for x in (renders, alphas) if x.requires_grad)]
+    return HostOutput(shot, (renders, alphas, info), marks or ())

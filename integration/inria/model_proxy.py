@@ -19,6 +19,7 @@ from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSl
 from integration.detail import sh0_offset
 from rasterizers.differentiable import Drawing
 from rasterizers.interface import Camera
+from rasterizers.torch_internals import base_of
 
 Role = Literal["gate", "detail"]
 """The changes of an override: opacities are multiplied by the gate, colours are offset by f_det."""
@@ -122,11 +123,7 @@ def host_output(
             f"render must return an RGB image of {camera.width}x{camera.height} pixels, the size of its camera, got shape "
             f"{tuple(image.shape)}. Train at the resolution of the photos, and pass no other size to render."
         )
-    marks = () if drawings or not image.requires_grad else (image,)
-    if marks and image._is_view():  # its hook would be lost where the host multiplies it in place by a mask
-        image = image.clone()
-        marks = (image,)
-        result = {**result, "render": image}
+    marks = () if drawings or not image.requires_grad else (base_of(image),)
     visible = radii > 0 if radii.dim() == 1 else (radii > 0).all(-1)
     if gate is not None:
         kept = gate > 0

@@ -110,7 +110,7 @@ PICTURES = {
 
 
 @pytest.mark.parametrize("made", PICTURES)
-def test_colours_of_the_means_count_once_where_no_single_drawing_is_the_picture(made):
+def test_colours_of_the_means_count_once_and_a_gain_learns_from_hr_where_no_single_drawing_is_the_picture(made, caplog):
     """By a function of the loop's own around this package's."""
 
     def gradients(picture):
@@ -120,15 +120,41 @@ def test_colours_of_the_means_count_once_where_no_single_drawing_is_the_picture(
             image = picture(lambda: found.append(autograd.rasterization(*args, **call)) or found[-1][0])
             return image, *found[-1][1:]
 
-        running = Running(Loop(colours="by the means"))
+        running = Running(Loop(colours="by the means", opacities="faded"))
         photo = scene().train[0].lr
         image = pictures(running.loop, running.clear.wrap(drawn), running.tensors(), [])(photo)[0][0]
         photometric(image, photo.image).backward()
-        return {name: p.grad for name, p in running.splats.items() if p.grad is not None}
+        return {name: p.grad for name, p in running.tensors().items() if p.grad is not None}
 
     found, expected = map(gradients, PICTURES[made])
+    assert found.keys() == expected.keys() >= {"gain"}
     for name, g in expected.items():
         torch.testing.assert_close(found[name], g, rtol=1e-3, atol=1e-6 * float(g.abs().max()), msg=name)
+    assert "learn from LR alone" not in caplog.text
+
+
+@needs("cpp")
+@pytest.mark.parametrize("given", ["sigmoid", "detached"])
+def test_parameters_that_the_function_itself_reads_learn_from_both_scales(given, caplog):
+    def gradients(given, read):
+        running = Running(Loop(function="another", opacities=given))
+
+        def drawn(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **call):
+            view, made = (viewmats, Ks, width, height), read(running.splats, opacities)
+            return FUNCTIONS["another"](means, quats, scales, made, colors, *view, **call)
+
+        photo = scene().train[0].lr
+        image = pictures(running.loop, running.clear.wrap(drawn), running.tensors(), [])(photo)[0]
+        image[0].mul_(0.9)  # a loop may write to what it gets
+        photometric(image[0], photo.image).backward()
+        return {name: p.grad for name, p in running.tensors().items() if p.grad is not None}
+
+    expected = gradients("sigmoid", lambda p, opacities: opacities)
+    found = gradients(given, lambda p, opacities: p["opacities"].sigmoid())
+    assert found.keys() == expected.keys()
+    for name, g in expected.items():
+        torch.testing.assert_close(found[name], g, rtol=1e-3, atol=1e-6 * float(g.abs().max()), msg=name)
+    assert "learn from LR alone" not in caplog.text
 
 
 @pytest.mark.parametrize("name", [ROWS, "detail"])

@@ -12,7 +12,7 @@ from rasterizers import torch_internals as of_torch
 from tests.helpers.paths import ROOT
 
 HIDDEN = {  # attributes of torch's objects
-    "_version", "_backward_hooks", "_post_accumulate_grad_hooks", "_schema", "_input_metadata",
+    "_version", "_base", "_backward_hooks", "_post_accumulate_grad_hooks", "_schema", "_input_metadata",
 }  # fmt: skip
 
 
@@ -65,6 +65,17 @@ def test_a_pass_calls_the_hooks_that_it_finds_in_their_mapping(register, hooks):
     hooks(x).clear()
     (2 * x).sum().backward()
     assert seen == ["another"]
+
+
+def test_the_node_of_a_views_base_stays_in_the_graph_where_the_view_is_written_in_place():
+    seen, base = [], 2 * Parameter(torch.ones(3))
+    view = base[:2]
+    for x in (view, of_torch.base_of(view)):
+        x.grad_fn.register_prehook(lambda _, shape=x.shape: seen.append(shape))
+    view.mul_(2)
+    view.sum().backward()
+    assert seen == [base.shape]
+    assert of_torch.base_of(base) is base
 
 
 def test_a_pass_that_fails_calls_nothing():
