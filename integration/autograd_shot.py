@@ -250,8 +250,8 @@ def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
     """
     if (shot := of_whole_image(shot)).drawing is not None:
         return shot
-    graph, centres = graph_of(shot.image), shot.gradient_slot.tensor
-    known = {*map(id, [*shot.params.values(), *copied_to(centres, shot.params["means"]), *centres_drawn(graph)])}
+    around, centres = _beside(shot), shot.gradient_slot.tensor
+    known = {*map(id, [*shot.params.values(), *copied_to(centres, shot.params["means"]), *centres_drawn(around)])}
 
     def others(behind: Graph) -> list[Tensor]:
         return [leaf for leaf in behind.leaves if id(leaf) not in known]
@@ -259,9 +259,10 @@ def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
     def names(leaves: Sequence[Tensor]) -> str:
         return ", ".join(f"{leaf.dtype} {[*leaf.shape]}" for leaf in leaves[:3])
 
-    if not (found := others(graph)) or (shot.drawn is not None and not others(_beside(shot))):
+    if not (found := others(around)):
         return shot
-    if (inputs := inputs_of(shot.image, graph, centres, shot.params, found)) is None:
+    graph = graph_of(shot.image)
+    if (inputs := inputs_of(shot.image, graph, centres, shot.params, others(graph))) is None:
         warn(
             "the loop trains %d tensors beside the Gaussians (%s), which learn from LR alone: the inputs of the rasterizer were "
             "not found, or their rows are not those of the parameters. Name them by AutogradShot(drawn=…), or compute them "

@@ -135,12 +135,12 @@ def test_colours_of_the_means_count_once_and_a_gain_learns_from_hr_where_no_sing
 
 @needs("cpp")
 @pytest.mark.parametrize("given", ["sigmoid", "detached"])
-def test_parameters_that_the_function_itself_reads_learn_from_both_scales(given, caplog):
+def test_parameters_and_a_gain_that_the_function_itself_reads_learn_from_both_scales(given, caplog):
     def gradients(given, read):
         running = Running(Loop(function="another", opacities=given))
 
         def drawn(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **call):
-            view, made = (viewmats, Ks, width, height), read(running.splats, opacities)
+            view, made = (viewmats, Ks, width, height), read(running.tensors(), opacities)
             return FUNCTIONS["another"](means, quats, scales, made, colors, *view, **call)
 
         photo = scene().train[0].lr
@@ -149,9 +149,9 @@ def test_parameters_that_the_function_itself_reads_learn_from_both_scales(given,
         photometric(image[0], photo.image).backward()
         return {name: p.grad for name, p in running.tensors().items() if p.grad is not None}
 
-    expected = gradients("sigmoid", lambda p, opacities: opacities)
-    found = gradients(given, lambda p, opacities: p["opacities"].sigmoid())
-    assert found.keys() == expected.keys()
+    expected = gradients("faded", lambda p, opacities: opacities)
+    found = gradients(given, lambda p, opacities: p["opacities"].sigmoid() * p["gain"])
+    assert found.keys() == expected.keys() >= {"gain"}
     for name, g in expected.items():
         torch.testing.assert_close(found[name], g, rtol=1e-3, atol=1e-6 * float(g.abs().max()), msg=name)
     assert "learn from LR alone" not in caplog.text
