@@ -251,7 +251,9 @@ def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
     if (shot := of_whole_image(shot)).drawing is not None:
         return shot
     around, centres = _beside(shot), shot.gradient_slot.tensor
-    known = {*map(id, [*shot.params.values(), *copied_to(centres, shot.params["means"]), *centres_drawn(around)])}
+    known = {*map(id, shot.params.values())}
+    for edge, tensor in ((centres, centres), *centres_drawn(around)):
+        known |= {*map(id, copied_to(edge, tensor, shot.params["means"]))}
 
     def others(behind: Graph) -> list[Tensor]:
         return [leaf for leaf in behind.leaves if id(leaf) not in known]

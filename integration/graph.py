@@ -107,22 +107,25 @@ class Inputs:
             yield found
 
 
-def centres_drawn(graph: Graph) -> Iterator[Tensor]:
-    """The leaves that get the screen gradients of what this package's rasterizers drew."""
+def centres_drawn(graph: Graph) -> Iterator[tuple[Edge, Tensor]]:
+    """Where the screen gradients go of what this package's rasterizers drew, and the centres."""
     for node, drawing in graph.drawn.items():
         inputs = sum(x is not None for x in drawing.inputs)  # the last arguments of the node, after the centres
-        behind = graph_of(GradientEdge(*node.next_functions[-1 - inputs])).leaves
-        yield from (x for x in behind if x.shape[-1:] == (2,))
+        yield GradientEdge(*node.next_functions[-1 - inputs]), drawing.rendering.means2d
 
 
-def copied_to(centres: Tensor, means: Tensor) -> list[Tensor]:
+def copied_to(edge: Edge, centres: Tensor, means: Tensor) -> list[Tensor]:
     """The leaf whose copy a tensor is, as hosts make one for the screen gradient (`torch.zeros(n, 3, requires_grad=True) + 0`);
     itself if it is a leaf. No optimizer steps it, unlike other leaves from which centres are computed, with those of `means`.
+
+    Args:
+        edge: of the tensor. centres: its values.
     """
-    leaves = graph_of(centres).leaves
+    leaves = graph_of(edge).leaves
     if means.requires_grad:  # without a wait for the device
         return leaves if len(leaves) == 1 else []
-    return [x for x in leaves if x.shape == centres.shape and torch.equal(x.to(centres), centres)]
+    alike = (x for x in leaves if x.numel() == centres.numel())  # gsplat's have a dimension of cameras
+    return [x for x in alike if torch.equal(x.view(centres.shape).to(centres), centres)]
 
 
 def inputs_of(
