@@ -38,7 +38,7 @@ def require_stored(s: Strategy, params: Mapping[str, Tensor]) -> None:
                     f"{entry} must be a tensor with a row for each Gaussian, {min(n, default=0)}, or without dimensions, got "
                     f"{_shown(x)}. Other tensors belong in run_state, and what can be computed again in cache."
                 )
-            if not isinstance(x, Tensor) or not _is_stored(x) or (where == "run_state" and x.requires_grad):
+            if not isinstance(x, Tensor) or x.layout is not torch.strided or (where == "run_state" and x.requires_grad):
                 raise AnswerError(
                     f"{entry} must be a tensor that requires no gradient, got {_shown(x)}. Hooks turn autograd on for a copy, "
                     "x.detach().requires_grad_()."
@@ -72,11 +72,7 @@ def require_not_negative(s: Strategy, hook: str, name: str, x: Tensor) -> None:
 
 def is_real(x: Any, *shapes: tuple[int, ...]) -> bool:
     """Return True if it is a dense tensor of one of the shapes. A conversion of complex numbers drops their imaginary part."""
-    return isinstance(x, Tensor) and x.shape in shapes and not x.is_complex() and _is_stored(x)
-
-
-def _is_stored(x: Tensor) -> bool:
-    return x.layout is torch.strided and not x.is_meta
+    return isinstance(x, Tensor) and x.shape in shapes and not x.is_complex() and x.layout is torch.strided
 
 
 def rows_like(
@@ -93,7 +89,7 @@ def rows_like(
     for name, x in answer.items():
         if name not in like:
             refuse(s, hook, f"attributes {whose}, {', '.join(like)}", name)
-        if not is_real(x, like[name].shape):
+        if not is_real(x, like[name].shape) or x.is_meta > like[name].is_meta:
             refuse(s, hook, f"{name} as a tensor {[*like[name].shape]}", x)
     g = Grads({name: x.double() if like[name].dtype == torch.float64 else x.float() for name, x in answer.items()})
     if finite:

@@ -203,7 +203,6 @@ ANSWERS = {
     ),
     "gate, complex": ("gate", lambda t, n: torch.ones(n) + 0j, "must give a tensor .*, got a complex tensor \\[30\\]"),
     "gate, sparse": ("gate", lambda t, n: torch.ones(n).to_sparse(), "got a tensor \\[30\\] of .*sparse_coo; .* to_dense"),
-    "gate, meta": ("gate", lambda t, n: torch.ones(n, device="meta"), "got a meta tensor \\[30\\], which has no numbers"),
     "keep, sparse": (
         "reconcile", lambda p, step: Weights(keep=p.dot.to_sparse()), "keep is a number or .*, got a tensor .* to_dense"
     ),
