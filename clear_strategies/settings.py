@@ -18,8 +18,9 @@ import traceback
 import types
 import typing
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import MISSING, fields, is_dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any, Final, Literal, Union, get_args, get_origin
 
@@ -48,6 +49,10 @@ CHANGES_NO_RESULT: Final = frozenset(
 does not compare them, a sweep's folders are not named by them, and a report does not distinguish runs by them.
 """
 _NUMBERS: Final = BeartypeConf(is_pep484_tower=True)  # an int is accepted where a float is asked for
+# What a list becomes, by the annotation.
+_KINDS: Final[Mapping[Any, Callable[[list[Any]], Any]]] = {
+    list: list, Sequence: list, Collection: list, Iterable: list, tuple: tuple, set: set, Set: set, frozenset: frozenset,
+}  # fmt: skip
 _EMPTY: Final = inspect.Parameter.empty
 _VARIADIC: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 _ABSENT: Final = object()
@@ -142,10 +147,10 @@ def _called(node: Mapping[str, Any], key: str) -> Any:
     parameters, hints = _parameters(function), _hints(function)
     given = {name: value for name, value in node.items() if name not in _KEYWORDS}
     _refuse_unknown(given, parameters, key, str(target))
-    arguments = {}
+    arguments, defaults = {}, _defaults(function)
     for name, value in given.items():
         inner = _joined(key, name)
-        built = build(value, inner)
+        built = build(_as_node(value, defaults.get(name), hints.get(name)), inner)
         arguments[name] = _of_type(built, hints[name], inner) if name in hints else built
     partial = functools.partial(function, **arguments)
     if node.get(_PARTIAL):
@@ -232,10 +237,12 @@ def _defaults(function: Callable[..., Any]) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     """A default as a configuration holds it; `_ABSENT` for what no configuration can hold."""
+    if isinstance(value, Enum | Path):
+        return value.name if isinstance(value, Enum) else str(value)
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    if isinstance(value, Path):
-        return str(value)
+    if isinstance(value, Set):
+        value = sorted(value, key=str)  # the same order in each process
     if isinstance(value, tuple | list):
         items = [_plain(item) for item in value]
         return _ABSENT if _ABSENT in items else items
@@ -261,6 +268,16 @@ def _merged(defaults: Mapping[str, Any], node: Mapping[str, Any]) -> dict[str, A
     return merged
 
 
+def _as_node(value: Any, default: Any, hint: Any) -> Any:
+    """The node of a nested dataclass, of which a setting names fields alone; another value as it is."""
+    if not isinstance(value, Mapping) or TARGET in value:
+        return value
+    if isinstance(default, Mapping) and TARGET in default:
+        return _merged(default, value)
+    kind: Any = next((part for part in _parts(hint) if is_dataclass(part)), None)
+    return value if kind is None else {TARGET: f"{kind.__module__}.{kind.__qualname__}", **value}
+
+
 def _refuse_unknown(
     given: Mapping[str, Any], parameters: Mapping[str, inspect.Parameter], key: str, target: str
 ) -> None:
@@ -275,46 +292,54 @@ def _refuse_unknown(
 
 
 def _of_type(value: Any, hint: Any, key: str) -> Any:
-    """The value, if it is of the annotated type; a list becomes the tuple that is asked for, and a text the path."""
-    origin = get_origin(hint)
-    if isinstance(value, dict) and isinstance(origin, type) and issubclass(origin, Mapping):
-        return {name: _of_type(entry, get_args(hint)[1], _joined(key, name)) for name, entry in value.items()}
-    candidates = [value]
-    if isinstance(value, list):
-        candidates += [tuple(value), _tuples(value)]
-    elif isinstance(value, str):
-        candidates.append(Path(value))
-    for candidate in candidates:
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", BeartypeDecorHintPep585DeprecationWarning)
-                if _is_of(candidate, hint):
-                    return candidate
-        except BeartypeException:  # a hint that beartype does not support
-            return value
+    """The value as the annotated type, see `_fitted`."""
+    for part in _parts(hint):
+        if isinstance(value, dict) and isinstance(origin := get_origin(part), type) and issubclass(origin, Mapping):
+            return {name: _of_type(entry, get_args(part)[1], _joined(key, name)) for name, entry in value.items()}
+    if (fitted := _fitted(value, hint)) is not _ABSENT:
+        return fitted
     shown = repr(value) if isinstance(value, str | int | float | list | Mapping | None) else f"a {type(value).__name__}"
-    parts = [_joined(key, f.name) for f in fields(hint) if f.init] if is_dataclass(hint) else []
-    remedy = f" Set {', '.join(parts)}." if parts else ""
+    remedy = ""
+    if is_dataclass(hint):
+        remedy = f" Set {', '.join(_joined(key, f.name) for f in fields(hint) if f.init)}."
+    elif isinstance(value, int | float) and _fitted(str(value), hint) is not _ABSENT:
+        remedy = f" As text it is written '{key}=\"{value}\"'."
     raise SettingError(f"{key}: must be {_in_words(hint)}, got {shown}.{remedy}")
 
 
-def _tuples(value: Any) -> Any:
-    """Lists in lists as tuples in tuples."""
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+def _parts(hint: Any) -> Sequence[Any]:
+    """The alternatives of an annotation."""
+    return get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
 
 
-def _is_of(value: Any, hint: Any) -> bool:
-    """True if every entry is of the annotated type. Beartype looks at one entry of a sequence, which it draws by `random`: a
-    wrong one may pass, and the program's own random numbers change.
+def _fitted(value: Any, hint: Any) -> Any:
+    """The value if it is of the annotated type; a list as the tuple or set that is asked for, a text as the path or the member
+    of an Enum; else `_ABSENT`.
+
+    Every entry is looked at: beartype looks at one of a sequence, which it draws by `random`, so a wrong one may pass, and the
+    program's own random numbers change.
     """
-    origin, parts = get_origin(hint), get_args(hint)
-    if origin in (Union, types.UnionType):
-        return any(_is_of(value, part) for part in parts)
-    if isinstance(origin, type) and issubclass(origin, Sequence) and (len(parts) == 1 or parts[1:] == (...,)):
-        return isinstance(value, origin) and not isinstance(value, str) and all(_is_of(x, parts[0]) for x in value)
+    if len(alternatives := _parts(hint)) > 1:
+        fits = [fit for part in alternatives if (fit := _fitted(value, part)) is not _ABSENT]
+        return next((fit for fit in fits if fit is value), fits[0] if fits else _ABSENT)
+    origin, parts = get_origin(hint) or hint, get_args(hint)
     if isinstance(value, bool) and (hint in (int, float) or (origin is Literal and not any(value is x for x in parts))):
-        return False  # to Python true is 1, to a user it is not
-    return is_bearable(value, hint, conf=_NUMBERS)
+        return _ABSENT  # to Python true is 1, to a user it is not
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return next(
+            (member for name, member in hint.__members__.items() if value in (name, member, member.value)), _ABSENT
+        )
+    if (kind := _KINDS.get(origin)) and isinstance(value, list | str):
+        each = parts if origin is tuple and parts and parts[1:] != (...,) else (parts[:1] or (Any,)) * len(value)
+        fits = [*map(_fitted, value, each)] if isinstance(value, list) and len(value) == len(each) else [_ABSENT]
+        return _ABSENT if any(fit is _ABSENT for fit in fits) else kind(fits)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", BeartypeDecorHintPep585DeprecationWarning)
+            forms = (value, Path(value)) if isinstance(value, str) else (value,)
+            return next((form for form in forms if is_bearable(form, hint, conf=_NUMBERS)), _ABSENT)
+    except BeartypeException:  # a hint that beartype does not support
+        return value
 
 
 _WORDS: Final[Mapping[Any, str]] = {
@@ -324,18 +349,22 @@ _WORDS: Final[Mapping[Any, str]] = {
 
 def _in_words(hint: Any) -> str:
     """An annotation in words, for users of YAML."""
-    origin, inner = get_origin(hint), get_args(hint)
+    origin, inner = get_origin(hint) or hint, get_args(hint)
+    words = f"a {origin.__name__}" if isinstance(origin, type) else str(hint)
     if hint in _WORDS:
-        return _WORDS[hint]
-    if origin in (Union, types.UnionType):
-        return " or ".join(dict.fromkeys(_in_words(part) for part in inner))
-    if origin is Literal:
-        return " or ".join(str(value) for value in inner)
-    if origin is tuple and inner[1:] != (...,):
-        return f"a list of {len(inner)} numbers"
-    if isinstance(origin, type) and inner:
-        return "a table of names" if issubclass(origin, Mapping) else f"a list, each entry {_in_words(inner[0])}"
-    return f"a {hint.__name__}" if isinstance(hint, type) else str(hint)
+        words = _WORDS[hint]
+    elif len(alternatives := _parts(hint)) > 1:
+        words = " or ".join(dict.fromkeys(map(_in_words, alternatives)))
+    elif origin is Literal or (isinstance(hint, type) and issubclass(hint, Enum)):
+        words = " or ".join(map(str, inner or hint.__members__))
+    elif origin is tuple and inner and inner[1:] != (...,):
+        each = "numbers" if {*inner} <= {int, float} else f"entries ({', '.join(map(_in_words, inner))})"
+        words = f"a list of {len(inner)} {each}"
+    elif origin in _KINDS:
+        words = "a list" + (f", each entry {_in_words(inner[0])}" if inner else "")
+    elif isinstance(origin, type) and issubclass(origin, Mapping):
+        words = "a table of names"
+    return words
 
 
 def _joined(key: str, name: Any) -> str:

@@ -2,8 +2,10 @@
 
 import random
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
+from enum import Enum
 from pathlib import Path
 from typing import Any, Literal
 
@@ -88,6 +90,54 @@ def test_a_text_becomes_the_path_and_lists_the_tuples_that_are_asked_for():
         build(target(Listed, pairs=[[1]]))
     with pytest.raises(SettingError, match="at: must be a path, got 3"):
         build(target(Listed, at=3))
+
+
+class Mode(Enum):
+    SOFT = "soft"
+    HARD = "hard"
+
+
+@dataclass(frozen=True)
+class Varied:
+    """Fields as a user's own class may have them."""
+
+    mode: Mode = Mode.SOFT
+    modes: AbstractSet[Mode] = frozenset({Mode.SOFT, Mode.HARD})
+    names: set[str] = field(default_factory=set)
+    paths: Sequence[Path] = ()
+    by_name: dict[str, Path] | None = None
+    folders: list[tuple[str, Path]] = field(default_factory=list)
+    inner: Inner = Inner(size=5)
+    maybe: Inner | None = None
+    call: Callable[[float], float] | None = None
+
+
+def test_settings_become_the_members_of_enums_the_sets_and_the_nested_dataclasses_that_are_asked_for():
+    written = {"paths": ["a"], "by_name": {"b": "c"}, "folders": [["d", "e"]]}
+    built = build(target(Varied, mode="HARD", modes=["soft"], names=["x"], **written))
+    assert built == Varied(Mode.HARD, {Mode.SOFT}, {"x"}, [Path("a")], {"b": Path("c")}, [("d", Path("e"))])
+    # As of a class that the command line names, whose defaults are in no file.
+    assert build(target(Varied, inner={"mode": "b"}, maybe={"size": 2})) == Varied(inner=Inner(5, "b"), maybe=Inner(2))
+    node = with_defaults(target(Varied))
+    assert (node["mode"], node["modes"]) == ("SOFT", ["HARD", "SOFT"])
+    assert build(node) == Varied(paths=[])
+
+
+@pytest.mark.parametrize(
+    ("message", "value"),
+    [
+        ("mode: must be SOFT or HARD, got 'both'.", "both"),
+        ("names: must be a list, each entry text, got 'ab'.", "ab"),
+        ("paths: must be a list, each entry a path, got [1].", [1]),
+        ("folders: must be a list, each entry a list of 2 entries (text, a path), got [['a']].", [["a"]]),
+        ("by_name.b: must be a path, got 3. As text it is written 'it.by_name.b=\"3\"'.", {"b": 3}),
+        ("call: must be a Callable or null, got 'abs'.", "abs"),
+    ],
+)
+def test_what_is_none_of_these_is_refused_in_words(message, value):
+    with pytest.raises(SettingError) as refused:
+        build({"it": target(Varied, **{message.split(":")[0].split(".")[0]: value})})
+    assert str(refused.value) == f"it.{message}"
 
 
 REFUSED = {
