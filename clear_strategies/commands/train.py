@@ -9,7 +9,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Final
 
@@ -59,6 +59,11 @@ def overrides(arguments: Sequence[str]) -> list[str]:
     if "://" in arguments[0]:
         raise SettingError(
             f"train: {arguments[0]} is an address. Download what is there, and name the folder of the photos."
+        )
+    named = [arguments[0], *takewhile(lambda word: "=" not in word and not is_of_hydra(word), rest)]
+    if len(named) > 1 and path_of(whole := " ".join(named)).exists():
+        raise SettingError(
+            f"train: {whole} has spaces, so it must be quoted: clear-strategies train {shlex.quote(whole)}."
         )
     if not path.exists():
         raise SettingError(f"train: {path} is not there. Name the folder of the photos or of the capture.")

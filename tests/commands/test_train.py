@@ -64,6 +64,16 @@ def test_a_folder_of_options_is_no_second_folder_of_photos(tmp_path, monkeypatch
         train.overrides(["photos", "mine"])
 
 
+@pytest.mark.parametrize("first_is_there", [False, True])
+def test_a_path_with_spaces_that_is_not_quoted_is_told(tmp_path, monkeypatch, first_is_there):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "Meine Fotos").mkdir()
+    if first_is_there:
+        (tmp_path / "Meine").mkdir()
+    with pytest.raises(SettingError, match=r"train: Meine Fotos has spaces.*: clear-strategies train 'Meine Fotos'\."):
+        train.overrides(["Meine", "Fotos", "fit.seed=1"])
+
+
 def test_a_tilde_that_no_shell_expanded_is_the_users_folder(tmp_path, monkeypatch):
     """In the argument of `train`, in Hydra's own folders, and in the arguments of the other commands."""
     monkeypatch.setenv("HOME", str(tmp_path))
