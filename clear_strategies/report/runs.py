@@ -101,8 +101,8 @@ class FinishedRun:
 
 
 def collect(folders: Iterable[Path]) -> list[FinishedRun]:
-    """Read every finished run at or below the folders and the links in them: the jobs of a sweep by number, other runs by path.
-    Unfinished and damaged runs are left out with a warning.
+    """Read every finished run at or below the folders and the links in them: sweep by sweep, their jobs by number, other runs by
+    path. Unfinished and damaged runs are left out with a warning.
     """
     folders = list(folders)
     folders += [link for folder in folders for link in sorted(folder.glob("*")) if link.is_symlink() and link.is_dir()]
@@ -110,7 +110,8 @@ def collect(folders: Iterable[Path]) -> list[FinishedRun]:
     for folder in folders:
         in_folder = sorted(path.parent for path in folder.rglob(FINISHED))
         sweeps = [run.parent for run in in_folder]
-        in_order = sorted(in_folder, key=lambda run: (sweeps.index(run.parent), _job(run), in_folder.index(run)))
+        places = _places(in_folder)
+        in_order = sorted(in_folder, key=lambda run: (sweeps.index(run.parent), places[run], in_folder.index(run)))
         finished |= dict.fromkeys(run.resolve() for run in in_order)
     for unfinished in sorted({path.parent for folder in folders for path in folder.rglob(_HYDRA)}):
         if unfinished.resolve() not in finished:
@@ -191,10 +192,27 @@ def _is_setting(override: str) -> bool:
     return not (named_elsewhere or key.startswith(("hydra", OWN)) or key in CHANGES_NO_RESULT)
 
 
-def _job(folder: Path) -> int:
-    """The run's number in its sweep; 0 for a single run, which then sorts by path."""
-    number = re.search(r"^    num: (\d+)$", _hydra(folder), re.MULTILINE)
-    return int(number[1]) if number else 0
+def _places(folders: Sequence[Path]) -> dict[Path, tuple[int, int]]:
+    """The sweep of each run among those that have its `hydra.sweep.dir`, by the dates of their ends, and its number there; of two
+    runs with one number, the later one begins another sweep. 0, 0 for a single run.
+    """
+    jobs = {run: int(said[1]) for run in folders if (said := re.search(r"^    num: (\d+)$", _hydra(run), re.MULTILINE))}
+    places, begun = dict.fromkeys(folders, (0, 0)), dict[Path, list[set[int]]]()
+    for run in sorted(jobs, key=lambda run: (_date(run), jobs[run])):
+        of_folder = begun.setdefault(run.parent, [set()])
+        if jobs[run] in of_folder[-1]:
+            of_folder.append(set())
+        of_folder[-1].add(jobs[run])
+        places[run] = len(of_folder), jobs[run]
+    return places
+
+
+def _date(folder: Path) -> str:
+    """When a run finished, UTC; empty if its file cannot be read, which `FinishedRun.read` tells."""
+    try:
+        return str(metrics.read(folder / FINISHED, "").provenance.get("date", ""))
+    except DataError:
+        return ""
 
 
 def _protocol(folder: Path) -> str | None:
