@@ -169,6 +169,8 @@ def _job(config: DictConfig, folder: Path) -> float | None:
 def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resumes: bool) -> None:
     """Log why a job ended, and exit; a job that fails in a sweep leaves a note instead, and the other jobs continue."""
     code, message = ending
+    if sweep.in_sweep() and isinstance(error, signals.Interrupted):
+        message = error.in_sweep
     if sweep.in_sweep() and resumes and isinstance(error, files.HeldError):
         _log.warning("left to the other process: %s", message)
         return

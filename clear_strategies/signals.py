@@ -21,12 +21,16 @@ class Interrupted(ClearError):
     Args:
         when: for the message, "before iteration 8".
         saved: the newest checkpoint.
+
+    Attributes:
+        in_sweep: the message of a job of a sweep, which tells how to go on itself: its command has other jobs as well.
     """
 
     def __init__(self, signum: int, when: str, saved: Path | None) -> None:
         self.signum, self.exit_code = signum, 128 + signum
-        where = f"Go on by the same command with fit.resume={saved}" if saved else "Nothing was saved"
-        super().__init__(f"stopped by {signal.Signals(signum).name} {when}. {where}.")
+        stopped, nothing = f"stopped by {signal.Signals(signum).name} {when}. ", "Nothing was saved."
+        self.in_sweep = stopped + (f"It is saved: {saved}." if saved else nothing)
+        super().__init__(stopped + (f"Go on by the same command with fit.resume={saved}." if saved else nothing))
 
 
 TWICE: Final = (signal.SIGINT, signal.SIGTERM)  # a second one acts at once
