@@ -132,7 +132,7 @@ def _remedy(key: str, value: str, overrides: Sequence[str], known: Mapping[str, 
     elif has_parameter(str(flat(known).get(f"{parent}.{TARGET}")), name):
         # of the user's own class, named by an override or a file
         remedy = f"Its class has it; a plus adds it: +{key}=…."
-    elif key.startswith("strategies.") and not known:
+    elif not known and (CONF / key.partition(".")[0].replace("strategies", "strategy")).is_dir():
         # the options are in a folder that only Hydra's command line knows
         remedy = f"If its class has it, a plus adds it: +{key}=…."
     elif key.startswith("strategies.") and any(_SWEEPS.match(o) for o in overrides):

@@ -98,10 +98,10 @@ def test_a_setting_of_a_class_that_a_sweep_leaves_in_place_is_added_by_a_plus():
     words = ["experiment=llff_x4", f"+strategies.x._target_={MINE}", "strategies.x.share=1"]
     with pytest.raises(SettingError, match=r"a plus adds it: \+strategies\.x\.share="):
         compose_module.composed(words, "config")
-    unknown = ConfigCompositionException("Could not override 'strategies.x.share'.")
-    from_a_folder = ["experiment=only_in_a_folder_of_config_dir", "+strategy=x", "strategies.x.share=1"]
-    told = not_composed(unknown, from_a_folder, "config")
-    assert "a plus adds it: +strategies.x.share=" in str(told)
+    for key in ("strategies.x.share", "data.reader.share"):
+        unknown = ConfigCompositionException(f"Could not override '{key}'.")
+        from_a_folder = ["data=only_in_a_folder_of_config_dir", "+strategy=x", f"{key}=1"]
+        assert f"a plus adds it: +{key}=" in str(not_composed(unknown, from_a_folder, "config"))
 
 
 def test_readings_stand_beside_any_strategies_and_what_is_set_by_name_wins():
