@@ -19,7 +19,7 @@ from clear_strategies.errors import DataError, counted
 from clear_strategies.files import FINISHED, read_bytes
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.metrics import Metrics
-from clear_strategies.settings import CHANGES_NO_RESULT, flat
+from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, flat
 from clear_strategies.training import checkpoint
 from clear_strategies.training.checkpoint import CHECKPOINTS, Checkpoint
 from clear_strategies.training.state import PHOTOS, TrainState, fingerprints
@@ -142,6 +142,10 @@ def require_same(source: Path, then: Mapping[str, Any], now: Mapping[str, Any]) 
     moved |= {*filter(_PLACE.fullmatch, keys)} if (folder_of(source) / CAMERAS).is_file() else set()
     moved |= {key for key in then.keys() ^ now.keys() if key.endswith(_DIGEST)}
     differ = [key for key in sorted(keys - moved) if then.get(key) != now.get(key)]
+    others = tuple(
+        key.removesuffix(TARGET) for key in differ if key.endswith(f".{TARGET}")
+    )  # of their fields all differ
+    differ = [key for key in differ if key.endswith(TARGET) or not key.startswith(others)]
     if differ:
         listed = "; ".join(f"{key}: {then.get(key)!r} then, {now.get(key)!r} now" for key in differ[:5])
         problem = f"this is not the configuration that wrote it: {listed}"

@@ -51,6 +51,15 @@ def test_device_threads_and_memory_may_differ_and_of_files_that_moved_the_conten
         resume.require_same(Path("there"), a, c)
 
 
+def test_of_a_strategy_that_one_configuration_lacks_no_field_is_listed():
+    """Five differences are listed: they would all be of the first such strategy."""
+    words = ("+strategy=gco", "fit.seed=1"), ("+strategy=[gco,p2g,svs]",)
+    with pytest.raises(DataError) as refused:
+        resume.require_same(Path("there"), *(compared(*overrides) for overrides in words))
+    listed = "fit.seed: 1 then, 0 now; strategies.p2g._target_: None then, 'clear_strategies.P2G' now; strategies.svs._target_: "
+    assert listed in str(refused.value)
+
+
 @pytest.mark.parametrize("left", ["checkpoint", "finished"])
 def test_a_run_goes_on_with_sr_images_at_another_place_and_not_with_others_be_it_that_they_shrink_to_the_same_photos(
     left: str, tmp_path: Path, caplog
