@@ -256,6 +256,7 @@ class Traits:
         depth_gradient: `WithTraits.vjp` takes alpha and depth. Without this trait, depth has no gradient, and alpha's needs a
             second image.
         radii: its renderings have `WithTraits.radii`.
+        shears: its renderings have `WithTraits.shears`.
     """
 
     devices: frozenset[str]
@@ -265,6 +266,7 @@ class Traits:
     absgrad: bool = False
     depth_gradient: bool = False
     radii: bool = False
+    shears: bool = False
 
 
 class WithTraits(Rendering, Protocol):
@@ -301,6 +303,13 @@ class WithTraits(Rendering, Protocol):
         """Half the size of each Gaussian's bounding box, px, rounded up; 0 for invisible ones. For the trait of this name.
 
         As in gsplat, the box ends where alpha falls below `alpha_min`, at 3.33 standard deviations at most.
+        """
+        ...
+
+    @property
+    def shears(self) -> Float[Tensor, "N 3"]:
+        """(A, S, D) of each Gaussian's exponent ½(A (dx + S dy)² + D dy²), A and D in 1/px²; meaningful for the visible ones. For
+        the trait of this name.
         """
         ...
 

@@ -37,7 +37,7 @@ from rasterizers import autograd
 from rasterizers.geometry import constant_band, depths
 from rasterizers.gsplat_picture import CameraView
 from rasterizers.inputs import Inputs
-from rasterizers.interface import Camera, Rasterizer, Splats
+from rasterizers.interface import Camera, Rasterizer, Rendering, Splats, WithTraits
 from rasterizers.reference.projection import footprints
 
 _NEAR: Final = 0.2  # what 3DGS draws begins at this depth
@@ -188,7 +188,7 @@ class GaussianRasterizer(torch.nn.Module):
         centres = drawn.means2d + _gradient_probe(means2D, camera, absgrad)
         image, alpha = view.picture(parts, centres, None, absgrad)
         image = image.permute(2, 0, 1).contiguous()
-        radii = _radii(drawn.visible, inputs, camera, kernel)
+        radii = _radii(drawn, inputs, camera, rasterizer, kernel)
         if s.confidence is not None:
             kinds: Sequence[str] = ("depth", "alpha")
         elif s.antialiasing is not None:
@@ -268,13 +268,19 @@ def _sum(
 
 
 @torch.no_grad()
-def _radii(visible: Bool[Tensor, " N"], inputs: Inputs, camera: Camera, kernel: float) -> Int[Tensor, " N"]:
+def _radii(
+    drawn: Rendering, inputs: Inputs, camera: Camera, rasterizer: Rasterizer, kernel: float
+) -> Int[Tensor, " N"]:
     """Three standard deviations along the longer axis, in pixels; 0: not visible."""
-    rows = visible.nonzero()[:, 0]
-    f = footprints(inputs.means[rows], inputs.quats[rows], inputs.scales[rows], camera, kernel)
-    a, c = f.deviations.square().unbind(-1)
-    middle, determinant = (a + c) / 2, c / f.conics[:, 0]
-    longest = middle + (middle * middle - determinant).clamp_min(0.1).sqrt()  # the eigenvalue as 3DGS bounds it
-    radii = torch.zeros(len(visible), dtype=torch.int32)
+    rows = drawn.visible.nonzero()[:, 0]
+    if rasterizer.traits.shears:
+        shears = cast(WithTraits, drawn).shears[rows]
+    else:
+        shapes = inputs.means[rows], inputs.quats[rows], inputs.scales[rows]
+        shears = footprints(*shapes, camera, kernel).shears
+    A, S, D = shears.unbind(-1)  # Σ' = [[1/A + S²/D, -S/D], [-S/D, 1/D]]
+    middle = (1 / A + (S * S + 1) / D) / 2
+    longest = middle + (middle * middle - 1 / (A * D)).clamp_min(0.1).sqrt()  # the eigenvalue as 3DGS bounds it
+    radii = torch.zeros(len(drawn.visible), dtype=torch.int32)
     radii[rows] = (3 * longest.sqrt()).ceil().int()
     return radii

@@ -57,6 +57,7 @@ class CppRasterizer(Backend):
         absgrad=True,
         depth_gradient=True,
         radii=True,
+        shears=True,
     )
 
     memory: int = 4096
@@ -147,6 +148,13 @@ class CppRendering:
         """See `WithTraits`."""
         out = torch.empty(len(self.visible), 2, dtype=torch.int32, device="cpu")
         self._frame.native.radii(self._grid, out, self._frame.threads)
+        return out
+
+    @property
+    def shears(self) -> Float[Tensor, "N 3"]:
+        """See `WithTraits`."""
+        out = self._frame.empty(len(self.visible), 3)
+        self._frame.native.shears(self._grid, out, self._frame.threads)
         return out
 
     def vjp(

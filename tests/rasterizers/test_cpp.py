@@ -1,7 +1,7 @@
 """The backend "cpp" alone: its instruction sets, its threads and its memory budget."""
 
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -9,8 +9,9 @@ import torch
 import rasterizers
 from clear_strategies.jobs import exit_codes
 from clear_strategies.kernels import native as strategies_native
-from rasterizers import BackendUnavailable, Camera, native
+from rasterizers import BackendUnavailable, Camera, Splats, native
 from rasterizers.interface import OutdatedKernels
+from rasterizers.reference.projection import footprints
 from rasterizers.testing import scene
 from tests.helpers.backends import camera, cotangents, dense_scene, everything, needs, require_same_bits
 
@@ -46,6 +47,18 @@ def test_bits_do_not_depend_on_the_memory_budget():
     bands = cpp(memory=4, threads=3)(splats, view, depth=True)
     assert bands._frame.native.pairs(0) * 16 > 4 << 20  # it needs several bands
     require_same_bits(everything(bands, v), one_band)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-4), (torch.float64, 1e-12)])
+def test_shears_are_those_of_the_reference_and_0_where_nothing_is_seen(dtype, tolerance):
+    splats = scene(500, bands=0, seed=2)
+    splats = Splats(*(x.to(dtype) for x in (getattr(splats, f.name) for f in fields(splats)) if x is not None))
+    drawn, visible = cpp()(splats, camera()), cpp()(splats, camera()).visible
+    shapes = (x[visible].double() for x in (splats.means, splats.quats, splats.scales))
+    expected = footprints(*shapes, camera(), cpp().kernel).shears
+    assert 0 < len(expected) < 500
+    assert torch.allclose(drawn.shears[visible].double(), expected, rtol=tolerance, atol=tolerance)
+    assert not drawn.shears[~visible].any()
 
 
 def covering(n):

@@ -118,6 +118,12 @@ void bind_frame(nb::module_& m) {
              nb::gil_scoped_release release;
              self.radii(i, radii, threads);
            })
+      .def("shears",
+           [](const F& self, int i, Write<T, -1, 3> out, int threads) {
+             T* shears = out.data();
+             nb::gil_scoped_release release;
+             self.shears(i, shears, threads);
+           })
       .def("vjp",
            [](F& self, int i, Read<T, -1, -1, -1, 3> image, std::optional<Read<T, -1, -1, -1>> alpha,
               std::optional<Read<T, -1, -1, -1>> depth, Write<T, -1, -1, 3> d_means,

@@ -86,18 +86,18 @@ class Frame {
   // Half the box of every Gaussian that the grid draws, [n, 2], in whole pixels; zeros for the others. It reaches to where alpha falls
   // below alpha_min, at most 3.33 standard deviations, as gsplat's.
   void radii(int i, std::int32_t* out, int threads) const {
-    const Target<T>& target = views_.at(i).target;
-    Pool::instance().run(threads, drawn_.chunks(), [&](std::int64_t chunk) {
-      const std::int64_t first = chunk * kChunk;
-      std::fill(out + 2 * first, out + 2 * std::min(splats_.n, first + kChunk), 0);
-      for (const std::uint32_t* number = drawn_.begin(chunk); number < drawn_.end(chunk); ++number) {
-        if (!target.ranges[*number].count()) continue;
-        const Ellipse<T>& e = target.ellipses[*number];
-        const T power = std::max((e.peak - settings_.log2_alpha_min) * (2 / kLog2E<T>), T(0));
-        const T reach = std::min(std::sqrt(power), T(3.33)) / std::sqrt(e.reach * (2 / kLog2E<T>));  // of `half`, which has a margin
-        const T half[2] = {e.half_x * reach, e.half_y * reach};
-        for (int c = 0; c < 2; ++c) out[2 * std::int64_t(*number) + c] = std::int32_t(std::ceil(std::clamp(half[c], T(1), T(1e9))));
-      }
+    each_ellipse<2>(i, out, threads, [&](const Ellipse<T>& e, std::int32_t* row) {
+      const T power = std::max((e.peak - settings_.log2_alpha_min) * (2 / kLog2E<T>), T(0));
+      const T reach = std::min(std::sqrt(power), T(3.33)) / std::sqrt(e.reach * (2 / kLog2E<T>));  // of `half`, which has a margin
+      const T half[2] = {e.half_x * reach, e.half_y * reach};
+      for (int c = 0; c < 2; ++c) row[c] = std::int32_t(std::ceil(std::clamp(half[c], T(1), T(1e9))));
+    });
+  }
+
+  // (A, S, D) of every Gaussian that the grid draws, whose exponent is ½(A (dx + S dy)² + D dy²), [n, 3]; zeros for the others.
+  void shears(int i, T* out, int threads) const {
+    each_ellipse<3>(i, out, threads, [](const Ellipse<T>& e, T* row) {
+      row[0] = e.A * (2 / kLog2E<T>), row[1] = e.S, row[2] = e.D * (2 / kLog2E<T>);
     });
   }
 
@@ -145,6 +145,18 @@ class Frame {
     Buffer<BlockEnd<T>> ends;           // [bins, 64]
     Bins bins;                          // the last listed band
   };
+
+  // Calls `f(ellipse, row)` for every Gaussian that the grid draws; the rows of the others are zeros.
+  template <int Width, class Number, class F>
+  void each_ellipse(int i, Number* out, int threads, const F& f) const {
+    const Target<T>& target = views_.at(i).target;
+    Pool::instance().run(threads, drawn_.chunks(), [&](std::int64_t chunk) {
+      const std::int64_t first = chunk * kChunk;
+      std::fill(out + Width * first, out + Width * std::min(splats_.n, first + kChunk), Number(0));
+      for (const std::uint32_t* number = drawn_.begin(chunk); number < drawn_.end(chunk); ++number)
+        if (target.ranges[*number].count()) f(target.ellipses[*number], out + Width * std::int64_t(*number));
+    });
+  }
 
   // Splits the image into bands whose pairs fit the budget: rows of bins, and a row that does not fit into parts of it.
   std::vector<Band> bands_of(const View& view, std::int64_t bytes_per_pair) const {
