@@ -18,7 +18,7 @@ import traceback
 import types
 import typing
 import warnings
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Iterable, Mapping, MutableSequence, MutableSet, Sequence, Set
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -51,7 +51,8 @@ does not compare them, a sweep's folders are not named by them, and a report doe
 _NUMBERS: Final = BeartypeConf(is_pep484_tower=True)  # an int is accepted where a float is asked for
 # What a list becomes, by the annotation.
 _KINDS: Final[Mapping[Any, Callable[[list[Any]], Any]]] = {
-    list: list, Sequence: list, Collection: list, Iterable: list, tuple: tuple, set: set, Set: set, frozenset: frozenset,
+    **dict.fromkeys((list, Sequence, MutableSequence, Collection, Iterable), list),
+    **dict.fromkeys((set, Set, MutableSet), set), frozenset: frozenset, tuple: tuple,
 }  # fmt: skip
 _EMPTY: Final = inspect.Parameter.empty
 _VARIADIC: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
@@ -147,8 +148,11 @@ def _called(node: Mapping[str, Any], key: str) -> Any:
     parameters, hints = _parameters(function), _hints(function)
     given = {name: value for name, value in node.items() if name not in _KEYWORDS}
     _refuse_unknown(given, parameters, key, str(target))
-    arguments, defaults = {}, _defaults(function)
+    arguments, own, defaults = {}, _own_defaults(function), _defaults(function)
     for name, value in given.items():
+        if name in defaults and repr(value) == repr(defaults[name]):  # not ==: to Python true is 1
+            arguments[name] = own[name]  # a text may stand for what no text becomes again, by its annotation
+            continue
         inner = _joined(key, name)
         built = build(_as_node(value, defaults.get(name), hints.get(name)), inner)
         arguments[name] = _of_type(built, hints[name], inner) if name in hints else built
@@ -220,25 +224,29 @@ def _hints(function: Callable[..., Any]) -> dict[str, Any]:
         return {}
 
 
+def _own_defaults(function: Callable[..., Any]) -> dict[str, Any]:
+    """The defaults of its signature, a new one where a dataclass has a factory."""
+    defaults = {name: p.default for name, p in _parameters(function).items() if p.default is not _EMPTY}
+    made = fields(function) if is_dataclass(function) else ()
+    return defaults | {
+        f.name: f.default_factory() for f in made if f.name in defaults and f.default_factory is not MISSING
+    }
+
+
 def _defaults(function: Callable[..., Any]) -> dict[str, Any]:
     """The node that calls the function with all of its defaults."""
-    declared = {f.name: f for f in fields(function)} if is_dataclass(function) else {}
-    node: dict[str, Any] = {TARGET: None}
-    for name, parameter in _parameters(function).items():
-        default = parameter.default
-        if (declaration := declared.get(name)) is not None:
-            if not declaration.metadata.get(LISTED, True):
-                continue
-            default = declaration.default if declaration.default_factory is MISSING else declaration.default_factory()
-        if (value := _plain(default)) is not _ABSENT:
-            node[name] = value
-    return node
+    declared = fields(function) if is_dataclass(function) else ()
+    unlisted = {f.name for f in declared if not f.metadata.get(LISTED, True)}
+    plain = {name: _plain(default) for name, default in _own_defaults(function).items() if name not in unlisted}
+    return {TARGET: None, **{name: value for name, value in plain.items() if value is not _ABSENT}}
 
 
 def _plain(value: Any) -> Any:
     """A default as a configuration holds it; `_ABSENT` for what no configuration can hold."""
-    if isinstance(value, Enum | Path):
-        return value.name if isinstance(value, Enum) else str(value)
+    if isinstance(value, Enum):
+        return value.name if value.name in type(value).__members__ else _ABSENT  # several flags have no name
+    if isinstance(value, Path):
+        return str(value)
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, Set):
@@ -246,12 +254,13 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple | list):
         items = [_plain(item) for item in value]
         return _ABSENT if _ABSENT in items else items
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
     if is_dataclass(value) and not isinstance(value, type):
         kind = type(value)
-        inner = {f.name: _plain(getattr(value, f.name)) for f in fields(value) if f.init}
-        return {TARGET: f"{kind.__module__}.{kind.__qualname__}", **inner}
+        inner = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
+        value = {TARGET: f"{kind.__module__}.{kind.__qualname__}", **inner}
+    if isinstance(value, Mapping):
+        entries = {key.name if isinstance(key, Enum) else str(key): _plain(item) for key, item in value.items()}
+        return _ABSENT if _ABSENT in entries.values() else entries
     return _ABSENT
 
 
@@ -293,11 +302,12 @@ def _refuse_unknown(
 
 def _of_type(value: Any, hint: Any, key: str) -> Any:
     """The value as the annotated type, see `_fitted`."""
-    for part in _parts(hint):
-        if isinstance(value, dict) and isinstance(origin := get_origin(part), type) and issubclass(origin, Mapping):
-            return {name: _of_type(entry, get_args(part)[1], _joined(key, name)) for name, entry in value.items()}
     if (fitted := _fitted(value, hint)) is not _ABSENT:
         return fitted
+    for part in _parts(hint):
+        if isinstance(value, dict) and _is_table(part):
+            for name, entry in value.items():
+                _of_type(entry, get_args(part)[1], _joined(key, name))  # the wrong entry is named
     shown = repr(value) if isinstance(value, str | int | float | list | Mapping | None) else f"a {type(value).__name__}"
     remedy = ""
     if is_dataclass(hint):
@@ -312,27 +322,41 @@ def _parts(hint: Any) -> Sequence[Any]:
     return get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
 
 
+def _is_table(hint: Any) -> bool:
+    origin = get_origin(hint)
+    return isinstance(origin, type) and issubclass(origin, Mapping) and len(get_args(hint)) == 2
+
+
+def _members(hint: Any) -> Mapping[str, Enum]:
+    """The members of an Enum, or those that a Literal names."""
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return hint.__members__
+    return {part.name: part for part in get_args(hint) if isinstance(part, Enum)} if get_origin(hint) is Literal else {}
+
+
+def _member(value: Any, hint: Any) -> Any:
+    """The member of `_members` by its name, or by its value; else `_ABSENT`."""
+    members = _members(hint)
+    by_value = (
+        m for m in members.values() if value == m.value and isinstance(value, bool) == isinstance(m.value, bool)
+    )
+    return members[value] if isinstance(value, str) and value in members else next(by_value, _ABSENT)
+
+
 def _fitted(value: Any, hint: Any) -> Any:
     """The value if it is of the annotated type; a list as the tuple or set that is asked for, a text as the path or the member
     of an Enum; else `_ABSENT`.
-
-    Every entry is looked at: beartype looks at one of a sequence, which it draws by `random`, so a wrong one may pass, and the
-    program's own random numbers change.
     """
     if len(alternatives := _parts(hint)) > 1:
         fits = [fit for part in alternatives if (fit := _fitted(value, part)) is not _ABSENT]
         return next((fit for fit in fits if fit is value), fits[0] if fits else _ABSENT)
     origin, parts = get_origin(hint) or hint, get_args(hint)
+    if _is_table(hint) if isinstance(value, dict) else isinstance(value, list | str) and origin in _KINDS:
+        return _with_entries_fitted(value, origin, parts)
+    if (member := _member(value, hint)) is not _ABSENT:
+        return member
     if isinstance(value, bool) and (hint in (int, float) or (origin is Literal and not any(value is x for x in parts))):
         return _ABSENT  # to Python true is 1, to a user it is not
-    if isinstance(hint, type) and issubclass(hint, Enum):
-        return next(
-            (member for name, member in hint.__members__.items() if value in (name, member, member.value)), _ABSENT
-        )
-    if (kind := _KINDS.get(origin)) and isinstance(value, list | str):
-        each = parts if origin is tuple and parts and parts[1:] != (...,) else (parts[:1] or (Any,)) * len(value)
-        fits = [*map(_fitted, value, each)] if isinstance(value, list) and len(value) == len(each) else [_ABSENT]
-        return _ABSENT if any(fit is _ABSENT for fit in fits) else kind(fits)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", BeartypeDecorHintPep585DeprecationWarning)
@@ -340,6 +364,20 @@ def _fitted(value: Any, hint: Any) -> Any:
             return next((form for form in forms if is_bearable(form, hint, conf=_NUMBERS)), _ABSENT)
     except BeartypeException:  # a hint that beartype does not support
         return value
+
+
+def _with_entries_fitted(value: list[Any] | str | dict[Any, Any], origin: Any, parts: Sequence[Any]) -> Any:
+    """`_fitted` of a list or table. Every entry is looked at: beartype looks at one of a sequence, which it draws by `random`, so
+    a wrong one may pass, and the program's own random numbers change.
+    """
+    if isinstance(value, dict):
+        items = [(_fitted(name, parts[0]), _fitted(entry, parts[1])) for name, entry in value.items()]
+        return _ABSENT if any(fit is _ABSENT for item in items for fit in item) else dict(items)
+    of_each = parts if origin is tuple and parts and parts[1:] != (...,) else (parts[:1] or (Any,)) * len(value)
+    if isinstance(value, str) or len(value) != len(of_each):
+        return _ABSENT
+    fits = [*map(_fitted, value, of_each)]
+    return _ABSENT if any(fit is _ABSENT for fit in fits) else _KINDS[origin](fits)
 
 
 _WORDS: Final[Mapping[Any, str]] = {
@@ -355,8 +393,8 @@ def _in_words(hint: Any) -> str:
         words = _WORDS[hint]
     elif len(alternatives := _parts(hint)) > 1:
         words = " or ".join(dict.fromkeys(map(_in_words, alternatives)))
-    elif origin is Literal or (isinstance(hint, type) and issubclass(hint, Enum)):
-        words = " or ".join(map(str, inner or hint.__members__))
+    elif origin is Literal or _members(hint):
+        words = " or ".join(x.name if isinstance(x, Enum) else str(x) for x in inner or _members(hint))
     elif origin is tuple and inner and inner[1:] != (...,):
         each = "numbers" if {*inner} <= {int, float} else f"entries ({', '.join(map(_in_words, inner))})"
         words = f"a list of {len(inner)} {each}"

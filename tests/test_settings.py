@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import Enum, Flag
 from pathlib import Path
 from typing import Any, Literal
 
@@ -120,7 +120,51 @@ def test_settings_become_the_members_of_enums_the_sets_and_the_nested_dataclasse
     assert build(target(Varied, inner={"mode": "b"}, maybe={"size": 2})) == Varied(inner=Inner(5, "b"), maybe=Inner(2))
     node = with_defaults(target(Varied))
     assert (node["mode"], node["modes"]) == ("SOFT", ["HARD", "SOFT"])
-    assert build(node) == Varied(paths=[])
+    assert build(node) == Varied()
+
+
+class Part(Flag):
+    MEANS = 1
+    SCALES = 2
+
+
+class Swapped(Enum):
+    ONE = "TWO"
+    TWO = "ONE"
+
+
+@dataclass(frozen=True)
+class OfObjects:
+    """Defaults that a text does not become again by the annotation alone."""
+
+    parts: Part = Part.MEANS | Part.SCALES
+    chosen: Literal[Mode.SOFT, "other"] = Mode.SOFT
+    either: Mode | str = Mode.HARD
+    anything: Any = frozenset({1})
+    where: str | Path = Path("there")
+    inner: Inner | None = field(default_factory=lambda: Inner(3))
+    by_mode: Mapping[Mode, Sequence[Path]] = field(default_factory=lambda: {Mode.SOFT: (Path("a"),)})
+    swapped: Swapped = Swapped.TWO
+    call: Mapping[str, Any] = field(default_factory=lambda: {"a": print})
+
+
+def of_objects(mode=Mode.SOFT, some=frozenset({1}), at=(1, 2)):
+    return mode, some, at
+
+
+def test_a_default_that_is_listed_stays_the_object_that_it_is():
+    assert build(with_defaults(target(OfObjects))) == OfObjects()
+    assert build(with_defaults(target(of_objects))) == of_objects()
+    built = build(
+        with_defaults(target(OfObjects, chosen="SOFT", either="SOFT", by_mode={"hard": ["b"]}, swapped="ONE"))
+    )
+    assert (built.chosen, built.either, built.swapped) == (Mode.SOFT, "SOFT", Swapped.ONE)
+    assert build(target(OfObjects, by_mode={"hard": ["b"]})).by_mode == {Mode.HARD: [Path("b")]}
+    assert not {"parts", "call"} & with_defaults(target(OfObjects)).keys()  # no text stands for these
+    with pytest.raises(SettingError, match=r"^chosen: must be SOFT or other, got 'HARD'"):
+        build(target(OfObjects, chosen="HARD"))
+    with pytest.raises(SettingError, match=r"^size: must be a whole number, got True"):
+        build(with_defaults(target(Inner, size=True)))
 
 
 @pytest.mark.parametrize(
