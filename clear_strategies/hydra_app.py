@@ -57,7 +57,6 @@ def help_unchecked() -> Iterator[None]:
         del ArgumentParser._check_help  # type: ignore[attr-defined]
 
 
-@help_unchecked()
 def main(overrides: Sequence[str] | None = None) -> None:
     """Hydra's command line, and `-v`.
 
@@ -70,7 +69,8 @@ def main(overrides: Sequence[str] | None = None) -> None:
         os.environ["COMP_LINE"] = line = f"{completed[1]}+strategy=best {completed[2]}"
         os.environ["COMP_POINT"] = str(len(line))
     gc.freeze()  # what has been imported stays: collections need not look through torch's objects, which takes 0.1 s
-    parser = get_args_parser()
+    with help_unchecked():
+        parser = get_args_parser()
     parser.add_argument("-v", "--verbose", action="store_true", help="Show details, as fit.verbose=true does")
     # Intermixed: Hydra's own call of the parser refuses settings on both sides of a flag.
     options, unknown = parser.parse_known_intermixed_args(sys.argv[1:] if overrides is None else overrides)

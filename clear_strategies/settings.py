@@ -366,7 +366,7 @@ def _fitted(value: Any, hint: Any) -> Any:
         return value
 
 
-def _with_entries_fitted(value: list[Any] | str | dict[Any, Any], origin: Any, parts: Sequence[Any]) -> Any:
+def _with_entries_fitted(value: list[Any] | str | dict[Any, Any], origin: Any, parts: tuple[Any, ...]) -> Any:
     """`_fitted` of a list or table. Every entry is looked at: beartype looks at one of a sequence, which it draws by `random`, so
     a wrong one may pass, and the program's own random numbers change.
     """
