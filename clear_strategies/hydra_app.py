@@ -21,6 +21,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
+from unittest import mock
 
 from hydra import version
 from hydra._internal.utils import _run_hydra, get_args_parser
@@ -47,16 +48,14 @@ FAILED: Final = "failed.txt"
 
 @contextmanager
 def help_unchecked() -> Iterator[None]:
-    """A scope in which argparse does not check the help of flags. Python 3.14 does where a flag is added, and refuses Hydra 1.3's
-    `--shell-completion`, whose help becomes a string only when it is shown.
+    """A scope in which argparse does not check the help of each flag that is added, as it does from Python 3.14 on: that of Hydra
+    1.3's `--shell-completion` is no string until it is shown.
     """
-    ArgumentParser._check_help = lambda self, action: None  # type: ignore[attr-defined]
-    try:
+    with mock.patch.object(ArgumentParser, "_check_help", create=True):
         yield
-    finally:
-        del ArgumentParser._check_help  # type: ignore[attr-defined]
 
 
+@help_unchecked()  # throughout: Hydra makes another parser of the line that a shell completes
 def main(overrides: Sequence[str] | None = None) -> None:
     """Hydra's command line, and `-v`.
 
@@ -69,8 +68,7 @@ def main(overrides: Sequence[str] | None = None) -> None:
         os.environ["COMP_LINE"] = line = f"{completed[1]}+strategy=best {completed[2]}"
         os.environ["COMP_POINT"] = str(len(line))
     gc.freeze()  # what has been imported stays: collections need not look through torch's objects, which takes 0.1 s
-    with help_unchecked():
-        parser = get_args_parser()
+    parser = get_args_parser()
     parser.add_argument("-v", "--verbose", action="store_true", help="Show details, as fit.verbose=true does")
     # Intermixed: Hydra's own call of the parser refuses settings on both sides of a flag.
     options, unknown = parser.parse_known_intermixed_args(sys.argv[1:] if overrides is None else overrides)

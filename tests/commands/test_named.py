@@ -64,7 +64,7 @@ def test_flags_are_those_of_hydra_where_argparse_checks_their_help(monkeypatch):
     monkeypatch.setattr(argparse._ActionsContainer, "add_argument", checked)
     with pytest.raises(ValueError, match="badly formed help string"):
         get_args_parser()
-    with hydra_app.help_unchecked():
+    with hydra_app.help_unchecked(), hydra_app.help_unchecked():
         assert get_args_parser().parse_args(["-m", "a=1,2"]).multirun
     with pytest.raises(ValueError, match="badly formed help string"):
         argparse.ArgumentParser().add_argument("--own", help=object())
