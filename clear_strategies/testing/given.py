@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -118,7 +118,7 @@ def conductor(
     return conductor
 
 
-def trace(conductor: Conductor, start: int, stop: int, n: int = N) -> Any:
+def trace(conductor: Conductor, start: int, stop: int, n: int = N) -> Iterator[Any]:
     """All answers of a conductor in the iterations from `start` to before `stop`."""
     for t in range(start, stop):
         lr, hr, view, params = situation(100 + t, n)
