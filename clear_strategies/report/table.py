@@ -210,8 +210,8 @@ def _differences(single: pd.DataFrame, key: str, means: pd.Series[float], agains
     """PSNR of each method minus that of its reference: over the pairs of one scene and seed, or, with fewer than two pairs, the
     difference of the two means, without an error.
     """
-    # A method whose PSNR is never finite must have a column as well.
-    by_seed = single.groupby([key, "scene", "seed"], sort=False)["psnr"].mean().unstack(key, sort=False)
+    # A method whose PSNR is never finite must have a column as well. Unsorted, pandas 2 unstacks into wrong columns.
+    by_seed = single.groupby([key, "scene", "seed"], sort=False)["psnr"].mean().unstack(key)
     references = [*map(_references(single, key, against).get, by_seed)]
     pairs = by_seed - by_seed[references].to_numpy()
     table = pd.DataFrame(

@@ -405,6 +405,6 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     }  # fmt: skip
     for owner, values in patches.items():
         for name, value in values.items():
-            monkeypatch.setattr(owner, name, value)
+            monkeypatch.setattr(owner, name, value, raising=owner is not torch._C)  # before 2.8 torch needs no end of a pool
     with contextlib.closing(autograd), _Operations(cuda):
         yield cuda

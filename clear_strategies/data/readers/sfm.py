@@ -301,7 +301,7 @@ def _require_parallax(pycolmap: Any, database: Path, root: Path) -> None:
     def distance_from_rotations(focal: float) -> float:
         """The median over pairs of the largest entry of |RᵀR - I| with R = K⁻¹ H K."""
         R = homographies * np.array([1 / focal, 1 / focal, 1])[:, None] * np.array([focal, focal, 1])
-        return float(np.median(np.abs(R.mT @ R - np.eye(3)).max(axis=(1, 2))))
+        return float(np.median(np.abs(R.swapaxes(1, 2) @ R - np.eye(3)).max(axis=(1, 2))))
 
     if min(map(distance_from_rotations, np.geomspace(0.3, 5.0, 60))) < _ROTATION:
         raise DataError(root, "poses", NO_PARALLAX, STEP_ASIDE)
