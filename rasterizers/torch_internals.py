@@ -53,10 +53,10 @@ def of_gradient(edge: torch.autograd.graph.GradientEdge) -> tuple[torch.Size, to
 
 
 def base_of(x: Tensor) -> Tensor:
-    """The tensor whose memory a view shows; itself if it is none. A view that is written in place gets another node, that of the
-    tensor stays in the graph.
+    """The tensor in the graph whose memory a view shows; itself if there is none. A view that is written in place gets another
+    node, that of the tensor stays in the graph. What a node of one's own returns as a view has a base outside of the graph.
     """
-    return x if x._base is None else x._base
+    return x if x._base is None or x._base.grad_fn is None else x._base
 
 
 def is_cat(node: Any) -> bool:

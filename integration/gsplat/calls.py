@@ -230,5 +230,5 @@ def host_output(
     around = [call[name] for name in ("viewmats", "Ks", "backgrounds") if call.get(name) is not None]
     shot = AutogradShot(image, means2d, visible, params, slot, drawn, drawings, around=around)
     if marks is not None:  # the function may also read parameters that it is not given
-        marks = [*marks, *(base_of(x) for x in (renders, alphas) if x.requires_grad)]
+        marks = [*marks, *(base_of(x) for x in (renders, alphas) if x is not None and x.requires_grad)]
     return HostOutput(shot, (renders, alphas, info), marks or ())

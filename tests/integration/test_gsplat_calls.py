@@ -141,7 +141,8 @@ def test_parameters_and_a_gain_that_the_function_itself_reads_learn_from_both_sc
 
         def drawn(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **call):
             view, made = (viewmats, Ks, width, height), read(running.tensors(), opacities)
-            return FUNCTIONS["another"](means, quats, scales, made, colors, *view, **call)
+            renders, _, info = FUNCTIONS["another"](means, quats, scales, made, colors, *view, **call)
+            return renders, None, info  # not every function has alphas
 
         photo = scene().train[0].lr
         image = pictures(running.loop, running.clear.wrap(drawn), running.tensors(), [])(photo)[0]

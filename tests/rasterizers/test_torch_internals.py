@@ -78,6 +78,21 @@ def test_the_node_of_a_views_base_stays_in_the_graph_where_the_view_is_written_i
     assert of_torch.base_of(base) is base
 
 
+def test_a_view_that_a_node_of_ones_own_returns_has_no_base_in_the_graph():
+    class Part(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, x):
+            return torch.cat((x, x))[: len(x)]
+
+        @staticmethod
+        def backward(ctx, g):
+            return g
+
+    part = Part.apply(Parameter(torch.ones(3)))
+    assert part._base is not None
+    assert of_torch.base_of(part) is part
+
+
 def test_a_pass_that_fails_calls_nothing():
     called = []
 
