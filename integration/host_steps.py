@@ -11,6 +11,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
+from itertools import count
 from typing import Any, Final
 
 import torch
@@ -55,14 +56,14 @@ class HostSteps:
         """Hook the steps of these optimizers, and remove the hooks of earlier ones. Only torch's optimizers have hooks."""
         if isinstance(optimizers, Mapping):
             raise TypeError("optimizers must be a sequence, got a dict: hook([*optimizers.values()]).")
-        distinct = list({id(o): o for o in optimizers if isinstance(o, torch.optim.Optimizer)}.values())
+        distinct = list({id(o): o for o in map(_unwrapped, optimizers) if isinstance(o, torch.optim.Optimizer)}.values())
         if list(map(id, distinct)) == list(map(id, self._hooked)):
             return
         for hook in self._hooks:
             hook.remove()
         self._hooked = distinct
         self._hooks = [
-            *(o.register_step_pre_hook(lambda o, given, named: self._before_one(o, *given, *named.values())) for o in distinct),
+            *(o.register_step_pre_hook(self._before_one) for o in distinct),
             *(o.register_step_post_hook(lambda o, *_: self._after_one(o)) for o in distinct),
         ]  # fmt: skip
 
@@ -113,15 +114,23 @@ class HostSteps:
         self._extra += gradients
         self._rendered = {name: p for name, p in params.items() if name != "detail"}
 
-    def _before_one(self, optimizer: torch.optim.Optimizer, *given: Any) -> None:
-        """Called before an optimizer steps, with the arguments of its `step`."""
+    def _before_one(self, optimizer: torch.optim.Optimizer, given: Sequence[Any], named: Mapping[str, Any]) -> Any:
+        """Called before an optimizer steps, with the arguments of its `step`; returns those that it gets instead, None: the same.
+
+        A closure may render. The step begins when it has returned.
+        """
         if self._steps_on_extra:
-            return
-        if any(callable(x) for x in given):
-            raise HostError(
-                "the host gives its optimizer a closure, which renders inside of step(), but the gradients are merged before. "
-                "Render and call loss.backward(), then step() without a closure."
-            )
+            return None
+
+        def of(x: Any) -> Any:
+            return _called_once(x, optimizer, lambda: self._begin_one(optimizer)) if callable(x) else x
+
+        if any(map(callable, (*given, *named.values()))):
+            return tuple(map(of, given)), {name: of(x) for name, x in named.items()}
+        self._begin_one(optimizer)
+        return None
+
+    def _begin_one(self, optimizer: torch.optim.Optimizer) -> None:
         self._before()
         if optimizer in self._stepped or self._stepped.isdisjoint(self._hooked):  # all may have been made anew
             self._stepped.clear()
@@ -169,6 +178,33 @@ class HostSteps:
         self._has_stepped = True
         if "means" in params:
             self._counts["extra views"] += len(self._extra)
+
+
+def _unwrapped(optimizer: Any) -> Any:
+    """The optimizer that steps, whose hooks run: those of Lightning and Accelerate hold it as `optimizer`."""
+    inner = getattr(optimizer, "optimizer", None)
+    return inner if isinstance(inner, torch.optim.Optimizer) else optimizer
+
+
+def _called_once(closure: Callable[[], Any], optimizer: torch.optim.Optimizer, then: Callable[[], None]) -> Callable[[], Any]:
+    """The closure of a step, which calls `then` when it has returned.
+
+    Raises (when called again):
+        HostError: a step has one merged gradient.
+    """
+    calls = count(1)
+
+    def once() -> Any:
+        if next(calls) > 1:
+            raise HostError(
+                f"{type(optimizer).__name__} calls its closure several times in a step, but a step has one merged gradient. Take "
+                "an optimizer that calls it once, as Adam does, or joint_loss in place of the loop's loss."
+            )
+        result = closure()
+        then()
+        return result
+
+    return once
 
 
 def stepping_scaler() -> GradScaler | None:

@@ -102,12 +102,48 @@ def test_optimizers_that_are_none_of_torchs_step_without_hooks():
     assert clear.attachment.counts["merges"] == clear.attachment.t == 2
 
 
-def test_a_step_with_a_closure_is_refused():
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_a_step_with_a_closure_that_renders_has_the_same_bits(wrapped):
+    """As in PyTorch Lightning, which gives each optimizer a closure, and wraps it in an object that holds it as `optimizer`."""
+
+    def trained(gives_closure, wrapped=False):
+        host, clear, render = started(GCO(), SVS(), toy.ShowsDark())
+        for name, o in host.optimizers.items() if wrapped else ():
+            inner = {"step": o.step, "zero_grad": o.zero_grad, "param_groups": o.param_groups}
+            host.optimizers[name] = SimpleNamespace(optimizer=o, **inner)
+        for i in range(4):
+
+            def backward(i=i):
+                render(i % 3).mean().backward()
+
+            closures = [backward, *[lambda: None] * (len(host.optimizers) - 1)]
+            for o, closure in zip(host.optimizers.values(), closures, strict=True):
+                if gives_closure:
+                    o.step(closure=closure)
+                else:
+                    closure()
+                    o.step()
+            for o in host.optimizers.values():
+                o.zero_grad()
+        return host.splats, clear.attachment.t, clear.attachment.counts
+
+    (splats, *rest), (expected, *of_loop) = trained(True, wrapped), trained(False)
+    assert rest == of_loop
+    assert all(torch.equal(p, expected[name]) for name, p in splats.items())
+
+
+def test_an_optimizer_that_calls_its_closure_several_times_is_refused():
     _, clear, render = started()
     optimizer = torch.optim.LBFGS([clear.params()["means"]])
     clear.attachment.hook([optimizer])
-    with pytest.raises(HostError, match="the host gives its optimizer a closure"):
-        optimizer.step(lambda: render().mean())
+
+    def closure():
+        loss = render().mean()
+        loss.backward()
+        return loss
+
+    with pytest.raises(HostError, match="LBFGS calls its closure several times in a step"):
+        optimizer.step(closure)
 
 
 def test_f_det_is_a_group_of_the_only_optimizer_unless_a_scheduler_counts_the_groups():
