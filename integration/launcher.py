@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import logging
 import runpy
 import sys
@@ -14,7 +15,7 @@ from typing import Any, NoReturn
 
 from clear_strategies import console
 from clear_strategies.commands import path_of
-from clear_strategies.errors import ClearError, DataError
+from clear_strategies.errors import ClearError, DataError, HostError
 from integration.replacing import replaced_attribute
 from integration.settings import Settings
 from integration.views import HostPhoto, save_photos
@@ -98,6 +99,23 @@ def run(options: argparse.Namespace, prepared: Callable[[], Trainer]) -> int:
         return 0
     _log.error("%s trained without CLEAR: %s.", options.script, trainer.otherwise)
     return 1
+
+
+def module_of_host(name: str, rule: str) -> Any:
+    """A module that the host must have.
+
+    Args:
+        rule: the rest of the error's sentence, and what to do.
+
+    Raises:
+        HostError: there is no such module.
+    """
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if not f"{name}.".startswith(f"{error.name}."):  # it imports another that is not there
+            raise
+        raise HostError(f"{sys.argv[0]} has no module {name}{rule}") from None
 
 
 def save_lr(photos: Iterable[HostPhoto], folder: Path) -> NoReturn:

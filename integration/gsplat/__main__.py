@@ -7,7 +7,6 @@ The script ends with `gsplat.distributed.cli(main, cfg)`; there CLEAR is install
 
 from __future__ import annotations
 
-import importlib
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -23,11 +22,13 @@ from integration.gsplat.simple_trainer import in_one_process, install, photos_of
 from integration.replacing import replaced_attribute
 from integration.settings import Settings
 
+VERSIONS: Final = ", which gsplat 1.4 to 1.6 have. Install one of these."
+
 
 @contextmanager
 def _installed_by_cli(save_lr: Path | None, settings: Settings) -> Iterator[list[Any]]:
     """Install CLEAR when the script calls `cli`, after it has defined its `Runner`."""
-    distributed: Any = importlib.import_module("gsplat.distributed")
+    distributed = launcher.module_of_host("gsplat.distributed", VERSIONS)
     cli, attached, undo = distributed.cli, list[Any](), ExitStack()
 
     def cli_with_clear(train: Any, *args: Any, **kwargs: Any) -> Any:
@@ -50,7 +51,7 @@ def _installed_by_cli(save_lr: Path | None, settings: Settings) -> Iterator[list
 def _refuse_to_train(*_: Any) -> None:
     raise HostError(
         f"{sys.argv[0]} trains, but does not call gsplat's cli, as simple_trainer.py does, where CLEAR is installed. Call attach "
-        "in its loop: docs/how-to/each-host.md."
+        "in its loop (docs/how-to/each-host.md), or write an adapter (docs/how-to/own-host.md)."
     )
 
 

@@ -7,7 +7,6 @@ another method whose name begins so, as InstantSplat's `training_setup_pp(opt, c
 from __future__ import annotations
 
 import functools
-import importlib
 import logging
 import sys
 from collections.abc import Callable, Iterator
@@ -90,14 +89,8 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
 
 
 def _of_trainer(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name != name:
-            raise
-        raise HostError(
-            f"{sys.argv[0]} has no module {name} beside it, as in 3DGS. Where it is elsewhere, as in EDGS, set PYTHONPATH."
-        ) from None
+    remedy = "Where it is elsewhere, as in EDGS, set PYTHONPATH. Another trainer needs an adapter: docs/how-to/own-host.md."
+    return launcher.module_of_host(name, f" beside it, as in 3DGS. {remedy}")
 
 
 TRAINER: Final = launcher.Trainer(

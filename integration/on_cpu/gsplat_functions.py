@@ -16,13 +16,15 @@ from torch import Tensor
 
 import rasterizers
 from clear_strategies.errors import HostError
+from integration.gsplat.__main__ import VERSIONS
+from integration.launcher import module_of_host
 
 
 def replace() -> None:
     """Replace `rasterization` and gsplat's CUDA functions; one that is not here raises `HostError` where it is called."""
     sys.modules["gsplat.cuda._backend"] = cast(Any, SimpleNamespace(_C=None))  # nothing compiled is loaded, or built
     everywhere: list[Any] = [
-        importlib.import_module(f"gsplat{name}")
+        module_of_host(f"gsplat{name}", VERSIONS)
         for name in ("", ".rendering", ".distributed", ".relocation", ".strategy.ops", ".cuda._wrapper")
     ]
     gsplat, rendering, *_ = everywhere

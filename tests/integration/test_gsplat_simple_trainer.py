@@ -3,6 +3,7 @@
 import copy
 import functools
 import pickle
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -132,6 +133,12 @@ def test_a_script_without_a_runner_that_trains_exits_with_an_error(launched, cap
     script.write_text("")
     assert launched(script=script) == 1
     assert "trained without CLEAR" in caplog.text
+
+
+def test_a_gsplat_without_its_modules_is_refused(launched, monkeypatch, caplog):
+    monkeypatch.setitem(sys.modules, "gsplat.distributed", None)
+    assert launched() == 2
+    assert "has no module gsplat.distributed, which gsplat 1.4 to 1.6 have" in caplog.text
 
 
 def test_a_process_for_each_gpu_which_would_train_without_clear_is_refused(launched, tmp_path, monkeypatch, caplog):

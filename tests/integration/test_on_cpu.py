@@ -333,6 +333,14 @@ def test_cuda_is_the_cpu_and_the_script_is_run_as_python_runs_it(tmp_path):
     assert seen == "seen ['cpu', 'cpu'] False torch.Size([9])"
 
 
+def test_a_gsplat_of_other_modules_is_refused(tmp_path):
+    (tmp_path / "trainer" / "gsplat").mkdir(parents=True)
+    (tmp_path / "trainer" / "gsplat" / "__init__.py").write_text("__version__ = '1.0.0'")
+    done = launched(tmp_path, "trainer/train.py")
+    assert done.returncode == 2
+    assert "has no module gsplat.rendering, which gsplat 1.4 to 1.6 have" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("use", "named"),
     [
