@@ -56,7 +56,9 @@ class HostSteps:
         """Hook the steps of these optimizers, and remove the hooks of earlier ones. Only torch's optimizers have hooks."""
         if isinstance(optimizers, Mapping):
             raise TypeError("optimizers must be a sequence, got a dict: hook([*optimizers.values()]).")
-        distinct = list({id(o): o for o in map(_unwrapped, optimizers) if isinstance(o, torch.optim.Optimizer)}.values())
+        distinct = list(
+            {id(o): o for o in map(_unwrapped, optimizers) if isinstance(o, torch.optim.Optimizer)}.values()
+        )
         if list(map(id, distinct)) == list(map(id, self._hooked)):
             return
         for hook in self._hooks:
@@ -186,7 +188,9 @@ def _unwrapped(optimizer: Any) -> Any:
     return inner if isinstance(inner, torch.optim.Optimizer) else optimizer
 
 
-def _called_once(closure: Callable[[], Any], optimizer: torch.optim.Optimizer, then: Callable[[], None]) -> Callable[[], Any]:
+def _called_once(
+    closure: Callable[[], Any], optimizer: torch.optim.Optimizer, then: Callable[[], None]
+) -> Callable[[], Any]:
     """The closure of a step, which calls `then` when it has returned.
 
     Raises (when called again):
@@ -217,16 +221,22 @@ def stepping_scaler() -> GradScaler | None:
 
 
 @cache
-def _parameters(step: Callable[..., Any]) -> frozenset[str]:
-    return frozenset(inspect.signature(step).parameters)
+def _parameters(step: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
+    return inspect.signature(step).parameters
 
 
 def _step(optimizer: torch.optim.Optimizer, rows: Tensor) -> None:
-    """One step of all rows. An Adam of visible Gaussians takes a mask of them, 3DGS's SparseGaussianAdam also their number."""
-    parameters = _parameters(type(optimizer).step)
-    known: dict[str, Any] = {}
-    if "visibility" in parameters:
-        known["visibility"] = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
-    if "N" in parameters:
-        known["N"] = len(rows)
-    optimizer.step(**known)
+    """One step of all rows. An Adam of visible Gaussians takes a mask of them, 3DGS's SparseGaussianAdam also their number.
+
+    Raises:
+        HostError: it takes something else.
+    """
+    _, *parameters = _parameters(type(optimizer).step).values()  # behind the optimizer itself
+    values: dict[str, Any] = {"visibility": torch.ones(len(rows), dtype=torch.bool, device=rows.device), "N": len(rows)}
+    required = [p.name for p in parameters if p.default is p.empty and p.kind is p.POSITIONAL_OR_KEYWORD]
+    if unknown := [name for name in required if name not in values]:
+        raise HostError(
+            f"{type(optimizer).__name__}.step needs {', '.join(unknown)}, which is not known for an extra view. Leave out what "
+            "adds views, e.g. --overrides '~strategies.pseudo_views'."
+        )
+    optimizer.step(**{p.name: values[p.name] for p in parameters if p.name in values})

@@ -89,7 +89,9 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
 
 
 def _of_trainer(name: str) -> Any:
-    remedy = "Where it is elsewhere, as in EDGS, set PYTHONPATH. Another trainer needs an adapter: docs/how-to/own-host.md."
+    remedy = (
+        "Where it is elsewhere, as in EDGS, set PYTHONPATH. Another trainer needs an adapter: docs/how-to/own-host.md."
+    )
     return launcher.module_of_host(name, f" beside it, as in 3DGS. {remedy}")
 
 

@@ -103,7 +103,8 @@ def host_output(
     ranks_by_third_column: bool,
 ) -> HostOutput:
     """The result of a host's `render`: a dict with "render" [3 or more, H, W], whose first channels are RGB, "viewspace_points"
-    [N, 2 or more] in NDC, "radii" and "visibility_filter" [N]. Gaussians that the gate drops are marked as not visible in it.
+    [N, 2 or more] in NDC, "visibility_filter", a mask or indices, and "radii" of all Gaussians or of those. Those that the gate
+    drops are marked as not visible in it.
 
     Args:
         camera: the camera of the photo at this resolution. drawings: see `AutogradShot`.
@@ -124,16 +125,21 @@ def host_output(
             f"{tuple(image.shape)}. Train at the resolution of the photos, and pass no other size to render."
         )
     marks = () if drawings or not image.requires_grad else (base_of(image),)
-    visible = radii > 0 if radii.dim() == 1 else (radii > 0).all(-1)
+    passed, n = result["visibility_filter"], len(params["means"])
+    if len(radii) == n:
+        visible = radii > 0 if radii.dim() == 1 else (radii > 0).all(-1)
+    else:  # those of the visible Gaussians alone, which the filter names
+        visible = torch.zeros(n, dtype=torch.bool, device=radii.device)
+        visible[passed.reshape(-1)] = True
     if gate is not None:
         kept = gate > 0
+        if len(radii) == n:
+            radii = radii * kept.view(-1, *[1] * (radii.dim() - 1)).to(radii)
+        else:
+            radii = radii[kept[passed.reshape(-1)]]
         visible = visible & kept
-        passed = result["visibility_filter"]
-        result = {
-            **result,
-            "radii": radii * kept.view(-1, *[1] * (radii.dim() - 1)).to(radii),
-            "visibility_filter": passed & kept if passed.dtype == torch.bool else passed[kept[passed.reshape(-1)]],
-        }
+        passed = passed & kept if passed.dtype == torch.bool else passed[kept[passed.reshape(-1)]]
+        result = {**result, "radii": radii, "visibility_filter": passed}
     width, height = camera.width, camera.height
     ranked = 2 if ranks_by_third_column and centres.shape[-1] == 3 else None
     slot = ScreenGradientSlot(centres, (width, height), (2 / width, 2 / height), ranked=ranked)

@@ -8,6 +8,7 @@ import torch
 
 import rasterizers
 from clear_strategies import Conductor
+from clear_strategies.errors import HostError
 from integration.inria.attached import _ATTRIBUTES
 from rasterizers import Splats
 from tests.helpers import gsplat_host, host_parts, toy
@@ -196,3 +197,13 @@ def test_an_adam_of_visible_gaussians_steps_all_of_them_on_an_extra_view(step):
     by_host, on_extra_view = calls
     assert torch.equal(by_host[0], on_extra_view[0])
     assert by_host[1:] == on_extra_view[1:]
+
+
+def test_an_optimizer_that_needs_something_else_to_step_on_an_extra_view_is_refused():
+    """As that of hierarchical 3DGS, which takes indices of Gaussians."""
+    trainer = Host(toy.scene(20))
+    other = type("Other", (torch.optim.Adam,), {"step": lambda self, relevant, closure=None: None})
+    trainer.optimizers = {name: other([p]) for name, p in trainer.splats.items()}
+    started(toy.ShowsDark(), host=trainer)[2]().mean().backward()
+    with pytest.raises(HostError, match=r"Other.step needs relevant, which is not known for an extra view"):
+        trainer.optimizers["means"].step(torch.arange(20))

@@ -163,17 +163,30 @@ def test_accumulated_passes_have_the_gradient_of_one_and_are_one_iteration(inria
         assert torch.allclose(found[1][name], g, rtol=1e-4, atol=1e-6 * float(g.abs().max())), name
 
 
+@pytest.mark.parametrize("compact", [False, True])
 @pytest.mark.parametrize("indices", [False, True])
-def test_dropped_gaussians_are_not_visible(indices, inria_host, inria_attached):
+def test_dropped_gaussians_are_not_visible(indices, compact, inria_host, inria_attached):
+    """Some forks have the radii of all Gaussians, hierarchical 3DGS of the visible ones alone."""
+
+    def render(*args, **kwargs):
+        package = inria_host.render(*args, **kwargs)
+        visible = package["radii"] > 0
+        passed = visible.clone()
+        passed[:3] = visible[:3] = False  # out of sight
+        radii = (torch.arange(1, N + 1) * visible)[visible] if compact else torch.arange(1, N + 1) * visible
+        return {**package, "radii": radii, "visibility_filter": passed.nonzero() if indices else passed}
+
     half = SVS(dropout=Ramp(maximum=0.5, shape="constant"))
     clear, gaussians, scene = inria_attached(half, objective=WITHOUT_HR, sr=None)
     z = clear.attachment.conductor.gate(1, N)
-    package = clear.wrap(inria_host.render)(scene.cameras[0], gaussians, None, None, indices=indices)
+    package = clear.wrap(render)(scene.cameras[0], gaussians, None, None)
     visible = package["visibility_filter"]
     visible = visible[:, 0] if indices else visible.nonzero()[:, 0]
-    assert 0 < len(visible) < N
+    assert 3 < len(visible) < N - 3
     assert bool((z[visible] > 0).all())
-    assert torch.equal((package["radii"] > 0).nonzero()[:, 0], visible)
+    assert not bool((visible < 3).any())
+    radii = package["radii"]
+    assert torch.equal(radii if compact else radii[radii > 0], visible + 1)
 
 
 def test_without_hr_no_sr_images_are_needed(inria_host, inria_capture, inria_attached):

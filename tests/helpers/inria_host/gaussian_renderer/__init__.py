@@ -10,7 +10,7 @@ ABSOLUTE = False
 RASTERIZER = load(fastest("cpu"), near=0.01, kernel=0.3, antialiased=False)
 
 
-def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, columns=3, indices=False):
+def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, columns=3):
     w, h = viewpoint_camera.image_width, viewpoint_camera.image_height
     focal = [size / 2 / torch.tan(torch.tensor(fov, dtype=torch.float64) / 2)
              for size, fov in ((w, viewpoint_camera.FoVx), (h, viewpoint_camera.FoVy))]  # fmt: skip
@@ -32,6 +32,6 @@ def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, columns=3
     return {
         "render": drawn.image.permute(2, 0, 1),
         "viewspace_points": dummy,
-        "visibility_filter": drawn.visible.nonzero() if indices else drawn.visible,
+        "visibility_filter": drawn.visible,
         "radii": drawn.visible.int() * 3,
     }
