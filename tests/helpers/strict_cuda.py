@@ -405,6 +405,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     }  # fmt: skip
     for owner, values in patches.items():
         for name, value in values.items():
-            monkeypatch.setattr(owner, name, value, raising=owner is not torch._C)  # before 2.8 torch needs no end of a pool
+            # Before 2.8, torch needs no end of a pool.
+            monkeypatch.setattr(owner, name, value, raising=owner is not torch._C)
     with contextlib.closing(autograd), _Operations(cuda):
         yield cuda
