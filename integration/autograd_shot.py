@@ -101,7 +101,7 @@ class AutogradShot:
         drawings: of this image by this package's rasterizers; a single one takes all cotangents in one pass.
         mask: the image is a drawing outside of any graph, times this mask.
         found: the inputs of another rasterizer, which `joint_loss` and hosts set.
-        around: the camera and the background beside `drawn`, in the graph; what they are computed from learns from LR alone.
+        around: inputs of the rasterizer beside `drawn`, as the camera; what they are computed from learns from LR alone.
 
     Raises:
         HostError: one of `drawn` has no row for each Gaussian.

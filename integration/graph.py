@@ -125,7 +125,7 @@ def copied_to(edge: Edge, centres: Tensor, means: Tensor) -> list[Tensor]:
     if means.requires_grad:  # without a wait for the device
         return leaves if len(leaves) == 1 else []
     alike = (x for x in leaves if x.numel() == centres.numel())  # gsplat's have a dimension of cameras
-    return [x for x in alike if torch.equal(x.view(centres.shape).to(centres), centres)]
+    return [x for x in alike if torch.equal(x.reshape(centres.shape).to(centres), centres)]
 
 
 def inputs_of(

@@ -23,7 +23,7 @@ from clear_strategies.errors import HostError
 
 _log = logging.getLogger(__name__)
 
-_OF_SAM: Final = 2  # passes over a view before the first step, by which steps by hand are told from those of SAM
+_OF_SAM: Final = 2  # merges over a view before the first step, by which steps by hand are told from those of SAM
 _PATIENCE: Final = 10  # iterations with extra views, one after the other, of which none made a step, before a warning
 
 

@@ -142,9 +142,8 @@ def require_same(source: Path, then: Mapping[str, Any], now: Mapping[str, Any]) 
     moved |= {*filter(_PLACE.fullmatch, keys)} if (folder_of(source) / CAMERAS).is_file() else set()
     moved |= {key for key in then.keys() ^ now.keys() if key.endswith(_DIGEST)}
     differ = [key for key in sorted(keys - moved) if then.get(key) != now.get(key)]
-    others = tuple(
-        key.removesuffix(TARGET) for key in differ if key.endswith(f".{TARGET}")
-    )  # of their fields all differ
+    # Of another class, all fields differ.
+    others = tuple(key.removesuffix(TARGET) for key in differ if key.endswith(f".{TARGET}"))
     differ = [key for key in differ if key.endswith(TARGET) or not key.startswith(others)]
     if differ:
         listed = "; ".join(f"{key}: {then.get(key)!r} then, {now.get(key)!r} now" for key in differ[:5])

@@ -89,7 +89,7 @@ def rows_like(
     for name, x in answer.items():
         if name not in like:
             refuse(s, hook, f"attributes {whose}, {', '.join(like)}", name)
-        if not is_real(x, like[name].shape) or x.is_meta > like[name].is_meta:
+        if not is_real(x, like[name].shape) or (x.is_meta and not like[name].is_meta):
             refuse(s, hook, f"{name} as a tensor {[*like[name].shape]}", x)
     g = Grads({name: x.double() if like[name].dtype == torch.float64 else x.float() for name, x in answer.items()})
     if finite:
