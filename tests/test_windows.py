@@ -193,7 +193,7 @@ def test_ctrl_c_saves_the_runs_of_a_sweep_in_processes(tmp_path):
     logs = [file.read_text() for file in (tmp_path / "all").glob("*/run.log")]
     assert len(logs) == 2
     for log in logs:
-        assert re.search(r"stopped by SIGINT before iteration \d+. Go on by", log)
+        assert re.search(r"stopped by SIGINT before iteration \d+. It is saved: ", log)
 
 
 @pytest.mark.slow
