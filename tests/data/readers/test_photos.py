@@ -81,7 +81,9 @@ def save_photos(folder: Path, pictures: Sequence[Image.Image], *focals: int) -> 
     folder.mkdir()
     for i, (picture, focal) in enumerate(zip(pictures, focals * (len(pictures) // len(focals)), strict=True)):
         exif = Image.Exif()
-        exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLengthIn35mmFilm: focal}  # Pillow 10 saves no other block that is new
+        exif[ExifTags.IFD.Exif] = {
+            ExifTags.Base.FocalLengthIn35mmFilm: focal
+        }  # Pillow 10 saves no other block that is new
         picture.save(folder / f"{i}.jpg", quality=95, exif=exif)
     return folder
 
