@@ -81,9 +81,8 @@ def save_photos(folder: Path, pictures: Sequence[Image.Image], *focals: int) -> 
     folder.mkdir()
     for i, (picture, focal) in enumerate(zip(pictures, focals * (len(pictures) // len(focals)), strict=True)):
         exif = Image.Exif()
-        exif[ExifTags.IFD.Exif] = {
-            ExifTags.Base.FocalLengthIn35mmFilm: focal
-        }  # Pillow 10 saves no other block that is new
+        # Pillow 10 saves no block that get_ifd has made.
+        exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLengthIn35mmFilm: focal}
         picture.save(folder / f"{i}.jpg", quality=95, exif=exif)
     return folder
 
