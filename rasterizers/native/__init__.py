@@ -81,8 +81,8 @@ def load_kernels(package: str, isa: str | None = None) -> ModuleType:
     baseline = _baseline(package)
     if isinstance(baseline, ImportError):
         raise BackendUnavailable(
-            f"the compiled kernels of {package} are not installed ({baseline}). This is a pure-Python installation, about "
-            "fifteen times slower on a CPU: install a C++20 compiler (Debian: apt install g++; macOS: xcode-select --install) "
+            f"the compiled kernels of {package} are not installed ({baseline}). This is a pure-Python installation, "
+            "over twenty times slower on a CPU: install a C++20 compiler (Debian: apt install g++; macOS: xcode-select --install) "
             "and install clear-strategies again."
         ) from baseline
     _require_same_sources(package, baseline)
