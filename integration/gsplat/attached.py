@@ -62,8 +62,9 @@ class Attached:
             calls that name none.
         iterations: of the loop. A warning before the first step says if HR would take part only after them.
         hr_by: what draws HR and extra views. "host": the wrapped function. A name of `rasterizers.load`: that rasterizer of this
-            package. "auto": on CUDA "warp", whose work is recorded and replayed, if it supports the call, otherwise "host".
-            Pictures of the two differ by 3e-3 at most, where only one of them blends a contribution of 1/255.
+            package. "auto": on CUDA "warp", whose work is recorded and replayed, if the wrapped function is gsplat's or ours and
+            "warp" supports the call; otherwise "host". Pictures of the two differ by 3e-3 at most, where only one of them blends
+            a contribution of 1/255.
 
     Attributes:
         views: the argument.
@@ -178,11 +179,12 @@ class Attached:
             )
 
         is_ours = "rgb_offset" in signature.parameters
+        preset = rasterization.keywords if isinstance(rasterization, functools.partial) else {}
 
         @functools.wraps(rasterization)
         @uncompiled
         def wrapped(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
-            call = signature.bind(*args, **kwargs).arguments
+            call = {**preset, **signature.bind(*args, **kwargs).arguments}
             for name in var_keyword:
                 call |= call.pop(name, {})
             if self.attachment.removed or is_transformed() or not self._draws_colors(call):
@@ -201,7 +203,7 @@ class Attached:
             if is_ours and not call["viewmats"].requires_grad:
                 call |= read()  # which it would read from a device itself, and so wait for HR
             render_at = self._renderer(rasterization, call, read, is_ours=is_ours)
-            with self._together(call) if is_ours else nullcontext():
+            with self._together(rasterization, call) if is_ours else nullcontext():
                 return self.attachment.render_view(view, render_at)  # type: ignore[no-any-return]
 
         setattr(wrapped, _ATTACHED, self)
@@ -241,9 +243,9 @@ class Attached:
             found = step_detail(self._optimizers, found, self._params["detail"], self.attachment.conductor.detail)
         self.attachment.hook(found)
 
-    def _together(self, call: Call) -> AbstractContextManager[None]:
+    def _together(self, rasterization: Rasterization, call: Call) -> AbstractContextManager[None]:
         """A context in which HR and LR share work, if this package's function draws both."""
-        if self._own_rasterizer(call) is not None:
+        if self._own_rasterizer(rasterization, call) is not None:
             return nullcontext()
         pose, K = (call[name].detach().reshape(n, n) for name, n in (("viewmats", 4), ("Ks", 3)))
         return drawing_ahead(pose, K, call["width"], call["height"])
@@ -274,7 +276,7 @@ class Attached:
             call, params = {**arguments, **self._background(arguments)}, self.params()
             if gate is not None:
                 call["opacities"] = gated(gate)
-            own = None if target == "lr" else self._own_rasterizer(call)
+            own = None if target == "lr" else self._own_rasterizer(rasterization, call)
             if target == "hr":
                 if own is None:
                     call = self._with_detail(call, is_ours=is_ours, trained=True)
@@ -294,9 +296,15 @@ class Attached:
 
         return render_at
 
-    def _own_rasterizer(self, call: Call) -> Rasterizer | None:
+    def _own_rasterizer(self, rasterization: Rasterization, call: Call) -> Rasterizer | None:
         """The rasterizer of this package that draws HR and extra views; None: the host's function does. Logs the choice once."""
         if self._hr_by == "host" or (self._hr_by == "auto" and call["means"].device.type != "cuda"):
+            return None
+        if self._hr_by == "auto" and not calls.draws_its_arguments(rasterization):
+            self._log_once(
+                "HR and extra views are drawn by the host's own function, since it may draw more than its arguments say. If it "
+                'only calls gsplat\'s rasterization with them, attach(…, hr_by="warp") draws them faster.'
+            )
             return None
         backend = "warp" if self._hr_by == "auto" else self._hr_by
         rasterizer = None

@@ -5,6 +5,7 @@ converts its result for `Attachment`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -33,6 +34,13 @@ _LENS: Final = (
     "viewmats_rs", "rays",
 )  # fmt: skip
 _POSE_RATIO: Final = 10  # by which the second nearest pose must be farther away, since frames of a video lie close
+
+
+def draws_its_arguments(rasterization: Rasterization) -> bool:
+    """Return True for gsplat's function and this package's; one that calls them may also change colours, say."""
+    function = rasterization.func if isinstance(rasterization, partial) else rasterization
+    module: str = getattr(function, "__globals__", {}).get("__name__", "")  # `functools.wraps` copies `__module__`
+    return module.partition(".")[0] in ("gsplat", "rasterizers")
 
 
 def cameras_read(call: Call) -> dict[str, Tensor]:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch.utils.checkpoint import checkpoint
 
+import rasterizers
 from clear_strategies import P2G, SVS, Conductor, PseudoViews, RandomBackground, Strategy, View
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.schedules import Ramp
@@ -44,6 +45,30 @@ def test_normals_beside_the_photo_have_no_detail_feature(named, grad):
         image = features(host.rasterization, host, normals)
     assert torch.equal(image, features(gsplat_host.rasterization, host, normals))
     assert clear.attachment.counts["LR renders"] == 1
+
+
+def test_hr_has_what_a_partial_presets():
+    given = {"rasterize_mode": "antialiased", "eps2d": 3.0}
+    found = []
+    for preset, named in ((given, {}), ({}, given)):
+        function = functools.partial(rasterizers.rasterization, backend="torch", **preset)
+        host, _, render = started(P2G(patch=4), host=Host(toy.scene(20), rasterization=function), hr_by="torch")
+        render(**named).mean().backward()
+        found.append([host.splats[name].grad for name in ("means", "scales", "sh0", "opacities")])
+    assert all(map(torch.equal, *found))
+
+
+def test_a_function_that_may_draw_more_than_its_arguments_say():
+    ours = rasterizers.rasterization
+
+    @functools.wraps(ours)
+    def brighter(*args, **kwargs):
+        image, *rest = ours(*args, **kwargs)
+        return (1.1 * image, *rest)
+
+    assert calls.draws_its_arguments(ours)
+    assert calls.draws_its_arguments(functools.partial(ours, backend="torch"))
+    assert not calls.draws_its_arguments(brighter)
 
 
 def test_a_depth_pass_is_part_of_its_step_and_colours_without_spherical_harmonics_have_the_detail_feature():
