@@ -82,8 +82,8 @@ def load_kernels(package: str, isa: str | None = None) -> ModuleType:
     if isinstance(baseline, ImportError):
         raise BackendUnavailable(
             f"the compiled kernels of {package} are not installed ({baseline}). This is a pure-Python installation, "
-            "over twenty times slower on a CPU: install a C++20 compiler (Debian: apt install g++; macOS: xcode-select --install) "
-            "and install clear-strategies again."
+            "over twenty times slower on a CPU: install a C++20 compiler (Debian: apt install g++; macOS: xcode-select "
+            "--install) and install clear-strategies again."
         ) from baseline
     _require_same_sources(package, baseline)
     supported = [*baseline.instruction_sets(), "baseline"]
