@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, cast
 
 import torch
@@ -32,6 +32,9 @@ from integration.graph import (
 from rasterizers.differentiable import Drawing, outer
 from rasterizers.interface import Camera, summed_vjp
 from rasterizers.torch_internals import is_hooked, version
+
+OfOthers = list[tuple[Tensor, Tensor]]
+"""Other leaves that the loop trains (of a network, an embedding), each with its gradient."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,6 +105,7 @@ class AutogradShot:
         mask: the image is a drawing outside of any graph, times this mask.
         found: the inputs of another rasterizer, which `joint_loss` and hosts set.
         around: inputs of the rasterizer beside `drawn`, as the camera; what they are computed from learns from LR alone.
+        of_others: receives the gradients of other leaves in each `vjp`.
 
     Raises:
         HostError: one of `drawn` has no row for each Gaussian.
@@ -117,6 +121,7 @@ class AutogradShot:
     mask: Float[Tensor, "H W 1"] | None = None
     found: Inputs | None = None
     around: Sequence[Tensor] = ()
+    of_others: OfOthers = field(default_factory=list)
 
     def __post_init__(self) -> None:
         for name, x in (self.drawn or {}).items():
@@ -153,14 +158,16 @@ class AutogradShot:
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None) -> list[Grads]:
         """See `Shot`; the graph is kept. Frozen parameters have gradient 0."""
+        found = self.gradients(cotangents, weight)
+        of_hf = [] if weight is None else [found.pop()]  # of f_det alone
         results = []
-        for g in self.gradients(cotangents):
-            raw, _ = to_leaves(g, self.edges, self.params)
+        for g in found:
+            raw, self.of_others[:] = to_leaves(g, self.edges, self.params, shared=self.shared)
             detail = g.get("detail") if g.colour is None else self._of_detail(*g.colour)
-            if "detail" in self.params and detail is not None:
+            if "detail" in self.params and detail is not None and weight is None:
                 raw["detail"] = detail
             results.append(Grads(every_number(raw, self.params), screen=g.screen))
-        return results if weight is None else summed(results, weight)
+        return results + [Grads({k: x for k, x in g.items() if k in self.params}, screen=g.screen) for g in of_hf]
 
     def gradients(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None) -> list[Grads]:
         """The first part of `vjp`, by the names of `drawn`; for this package's rasterizers the colours' gradient is factors."""
@@ -276,10 +283,6 @@ def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
         told = "%d tensors (%s) reach the image beside the rasterizer, too, and learn from LR alone."
         warn(told, len(shared), names(shared))
     return replace(shot, found=inputs) if others(graph_of(*inputs.edges.values())) else shot
-
-
-OfOthers = list[tuple[Tensor, Tensor]]
-"""Other leaves that the loop trains (of a network, an embedding), each with its gradient."""
 
 
 def side_of_leaves(

@@ -7,7 +7,7 @@ that must stay as it is, see attachment.py.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 from weakref import WeakKeyDictionary
 
@@ -23,15 +23,7 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Update
 from clear_strategies.strategies.base import overrides
 from integration.announcement import Once
-from integration.autograd_shot import (
-    AutogradShot,
-    OfOthers,
-    at_inputs,
-    every_number,
-    of_whole_image,
-    require_named,
-    to_leaves,
-)
+from integration.autograd_shot import AutogradShot, at_inputs, of_whole_image, require_named
 from integration.densification import ScoreScaler, score_for_host
 from integration.graph import Graph, edge_of, graph_of, require_apart, require_in_order, without_hooks
 from integration.host import require_leaves
@@ -87,13 +79,15 @@ def joint_loss(
         if isinstance(lr, AutogradShot):
             lr = of_whole_image(lr)
             require_apart({} if lr.drawing else lr.drawn or {})
-        warn = _ONCE.setdefault(conductor, Once(_log.warning))
-        to_others = _HrShot(hr, warn) if isinstance(hr, AutogradShot) else None
-        update = conductor.update(values, lr, to_others or hr, view, t)
+        if isinstance(hr, AutogradShot):
+            require_apart(hr.drawn or {})
+            hr = at_inputs(hr, _ONCE.setdefault(conductor, Once(_log.warning)))
+            require_in_order("hr", hr.inputs, hr.params)
+        update = conductor.update(values, lr, hr, view, t)
         others = [*_others(params, lr, of_lr.leaves, update)]
     objective, λ = conductor.objective, conductor.objective.lambda_hr(t)
-    if to_others is not None and λ > 0:
-        others += [(leaf, λ * g) for leaf, g in to_others.of_others]
+    if isinstance(hr, AutogradShot) and λ > 0:
+        others += [(leaf, λ * g) for leaf, g in hr.of_others]
     losses = update.losses
     value = objective.lambda_lr * losses["lr"] + λ * (
         losses.get("base", 0.0) + objective.lambda_hf * losses.get("hf", 0.0)
@@ -214,34 +208,6 @@ def _require_started(conductor: Conductor) -> None:
             raise ValueError(
                 f"{type(s).__name__} has not started. Call conductor.on_fit_start(len(views), seed, views=views) before the loop."
             )
-
-
-class _HrShot:
-    """A host's rendering at HR, with one pass through the host's graph for both cotangents.
-
-    Attributes:
-        of_others: the gradients of other leaves in the last pass.
-    """
-
-    def __init__(self, shot: AutogradShot, warn: Callable[..., None]) -> None:
-        require_apart(shot.drawn or {})
-        shot = at_inputs(shot, warn)
-        require_in_order("hr", shot.inputs, shot.params)
-        self.image, self.means2d, self.visible, self._shot = shot.image, shot.means2d, shot.visible, shot
-        self.of_others: OfOthers = []
-
-    def vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None) -> list[Grads]:
-        """See `Shot`."""
-        if weight is None:
-            return [self._to_leaves(g) for g in self._shot.gradients(cotangents)]
-        *each, of_hf = self._shot.gradients(cotangents, weight)
-        detail = {name: g for name, g in of_hf.items() if name in self._shot.params}
-        return [*map(self._to_leaves, each), Grads(detail, screen=of_hf.screen)]
-
-    def _to_leaves(self, g: Grads) -> Grads:
-        shot = self._shot
-        raw, self.of_others = to_leaves(g, shot.edges, shot.params, shared=shot.shared)
-        return Grads(every_number(raw, shot.params), screen=g.screen)
 
 
 def _others(
