@@ -74,7 +74,7 @@ def joined(x: Tensor) -> list[tuple[Edge, slice]]:
     return [*zip(edges, map(slice, [0, *ends], ends), strict=True)]
 
 
-class Inputs:
+class Inputs(NamedTuple):
     """The inputs of the rasterizer that drew an image in a host's graph, found without its help.
 
     A rasterizer is a node of autograd that passes the screen gradient on to the tensor of projected centres, and stands between
@@ -87,10 +87,9 @@ class Inputs:
         shared: leaves behind these that reach the image beside the rasterizer, too, of whose gradients the edges bring a part.
     """
 
-    def __init__(
-        self, nodes: Collection[Any], edges: Mapping[str, GradientEdge], shared: Sequence[Tensor] = ()
-    ) -> None:  # fmt: skip
-        self._nodes, self.edges, self.shared = nodes, edges, shared
+    nodes: Collection[Any]
+    edges: Mapping[str, GradientEdge]
+    shared: Sequence[Tensor] = ()
 
     @contextmanager
     def collected(self) -> Iterator[dict[str, Tensor]]:
@@ -102,7 +101,7 @@ class Inputs:
             found.update({name: g for name, g in of_node.items() if g is not None and name in self.edges})
 
         with ExitStack() as hooks:
-            for i, node in enumerate(self._nodes):
+            for i, node in enumerate(self.nodes):
                 hooks.callback(node.register_hook(lambda of_inputs, _, i=i: keep(i, of_inputs)).remove)
             yield found
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from operator import attrgetter
-from typing import Any, Final
+from typing import Any, Final, cast
 from weakref import WeakMethod, WeakValueDictionary
 
 import torch
@@ -163,27 +163,25 @@ class Pending:
 
         Hooks that autograd holds must not refer to the attachment or to this object, whose tensors would then never be freed.
         """
-        if self.output is None:
-            return
-        nth, screen = self.nth, self.screen
+        output, nth, screen = cast(HostOutput, self.output), self.nth, self.screen
 
         def called() -> TakeColours | None:
             return None if (alive := reached()) is None else alive(nth)
 
-        for drawing in self.output.shot.drawings:
+        for drawing in output.shot.drawings:
             drawing.hook.reached = called
 
         def on_gradient(_: Sequence[Tensor]) -> None:  # returns None, so that the gradient stays
             called()
 
-        if any(mark.is_leaf and mark.requires_grad for mark in self.output.marks):
+        if any(mark.is_leaf and mark.requires_grad for mark in output.marks):
             raise HostError(
                 f"a mark of {self.view} is a leaf, which a backward pass may reach after other parameters. Mark what the loop "
                 "gets, e.g. the image."
             )
-        for mark in filter(attrgetter("requires_grad"), self.output.marks):
+        for mark in filter(attrgetter("requires_grad"), output.marks):
             edge_of(mark).node.register_prehook(on_gradient)  # stays if the host writes to the mark in place
-        centres = self.output.shot.gradient_slot.tensor
+        centres = output.shot.gradient_slot.tensor
         if to_screen and centres.requires_grad:
 
             def keep(gradient: Tensor) -> None:

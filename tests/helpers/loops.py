@@ -27,9 +27,7 @@ COLOURS = {
     "with an offset": lambda p: torch.cat((p["sh0"] + p["offset"], p["shN"]), 1),
     "by the means": lambda p: torch.cat((p["sh0"] + p["means"][:, None], p["shN"]), 1),
     "an offset with them": lambda p: torch.cat((p["offset"] + p["sh0"], p["shN"]), 1),
-    "twice": lambda p: torch.cat((p["sh0"] + p["sh0"], p["shN"]), 1),
     "once and a half": lambda p: torch.cat((p["sh0"] + 0.5 * p["sh0"], p["shN"]), 1),
-    "added twice": lambda p: torch.cat((torch.add(p["offset"].detach(), p["sh0"], alpha=2), p["shN"]), 1),
     "times a gain": lambda p: torch.cat((p["sh0"], p["shN"]), 1) * p["gain"],
     "of three": lambda p: torch.cat((p["sh0"], p["shN"][:, :3], p["shN"][:, 3:]), 1),
     "viewed": lambda p: torch.cat((p["sh0"], p["shN"]), 1).view(len(p["sh0"]), -1, 3),
@@ -97,7 +95,6 @@ def passes(*each):
 
 PASSES = {
     "one": lambda loss, p: loss.backward(),
-    "one that keeps the graph": lambda loss, p: loss.backward(retain_graph=True),
     "one with a graph": lambda loss, p: loss.backward(create_graph=True),
     "asked before": passes(asked, lambda loss, p: loss.backward()),
     "asked after": passes(lambda loss, p: loss.backward(retain_graph=True), asked),
@@ -184,13 +181,13 @@ CHOICES = {
 
 
 def of_any_two_parts() -> list[Loop]:
-    """Random loops in which all parts that can meet do so by two and two, about half of each loop's parts the ordinary ones. Each
+    """Random loops in which all parts that can meet do so by two and two, about a sixth of each loop's parts the ordinary ones. Each
     is the one of forty in which most parts meet for the first time.
     """
     chance = random.Random(0)  # noqa: S311
 
     def drawn() -> Loop:
-        return Loop(**{name: chance.choice([*values]) for name, values in CHOICES.items() if chance.random() < 0.5})
+        return Loop(**{name: chance.choice([*values]) for name, values in CHOICES.items() if chance.random() < 0.85})
 
     loops, met, in_vain = list[Loop](), set[Pair](), 0
     while in_vain < 3:
@@ -353,7 +350,7 @@ def reference(loop: Loop, conductor, p, view):
     """
     objective, names = conductor.objective, [name for name in PARAMETERS if p[name].requires_grad]
     before = {name: x.grad for name, x in p.items()}
-    picture = pictures(loop, functools.partial(unrecorded, backend="torch"), p, [])
+    picture = pictures(loop, functools.partial(unrecorded, backend="cpp"), p, [])
     image = picture(view.hr, rgb_offset=p["detail"])[0][0]
     beside = "offset", "gain", "shift", "bands"
     of = [p[name] for name in (*names, *beside, "detail")]
