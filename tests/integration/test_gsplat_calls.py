@@ -366,8 +366,7 @@ def test_a_rendering_that_a_backward_pass_makes_is_refused(reentrant):
 @pytest.mark.parametrize(
     ("strategies", "more", "refused"),
     [
-        ([PseudoViews()], {"camera_model": "fisheye"}, "camera_model=fisheye"),
-        ([PseudoViews()], {"radial_coeffs": torch.zeros(1, 6)}, "radial_coeffs"),
+        ([PseudoViews()], {"camera_model": "fisheye", "radial_coeffs": torch.zeros(1, 6)}, "radial_coeffs, camera_model=fisheye"),
         ([PseudoViews()], {"camera_model": "pinhole", "radial_coeffs": None}, ""),
         ([], {"camera_model": "fisheye"}, ""),
     ],
@@ -518,7 +517,7 @@ def test_a_detail_feature_whose_ten_gradients_no_optimizer_steps_on_gives_a_warn
 ):
     conductor = Conductor(P2G(patch=4), objective=objective, statistics_from=0)  # HR is drawn without λ_HR, too
     densifier = SimpleNamespace(grow_grad2d=2e-4, refine_stop_iter=10**6)  # which reads P2G's score
-    host, clear, render = started(conductor=conductor, accumulation=accumulation, strategy=densifier)
+    host, clear, render = started(conductor=conductor, accumulation=accumulation, strategy=densifier, scene=scene())
     for i in range(12):
         render(i % 3).mean().backward()
         if (i + 1) % accumulation == 0:

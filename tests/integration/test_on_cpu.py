@@ -421,11 +421,11 @@ def test_gsplats_functions_are_there_without_cuda_and_those_that_are_not_are_nam
 def test_with_strategies_it_does_what_the_trainers_launcher_does(inria_capture, inria_launched):
     """The trainer of tests/helpers/inria_host, in both."""
     options = ["--strategies", "clear", "--sr", "sr", *(f"--overrides={row}" for row in FROM_START)]
-    script = [FOLDER / "train.py", "-s", inria_capture, "--save", "ours.safetensors", "--densify_until_iter", "0"]
+    script = [FOLDER / "train.py", "-s", inria_capture, "--save", "ours.safetensors", "--iterations", "6", "--densify_until_iter", "0"]
     done = launched(inria_capture, *options, *script)
     assert done.returncode == 0, done.stderr
     file = inria_capture / "theirs.safetensors"
-    assert inria_launched("--save", file, "--densify_until_iter", "0") == 0
+    assert inria_launched("--save", file, "--iterations", "6", "--densify_until_iter", "0") == 0
     ours, theirs = load_file(inria_capture / "ours.safetensors"), load_file(file)
     assert ours.keys() == theirs.keys()
     assert all(torch.allclose(ours[name], theirs[name], atol=1e-5) for name in ours)

@@ -20,7 +20,7 @@ MODES = ["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 GRID = [
     pytest.param(per_view, sh_degree, mode, packed, batch, id=f"{per_view}-{sh_degree}-{mode}-{packed}-{batch}")
     for per_view, sh_degree, mode, packed, batch in itertools.product(
-        [True, False], [None, 3], MODES, [True, False], [(), (2,), (1, 2)]
+        [True, False], [None, 3], MODES, [True, False], [(), (1, 2)]
     )
 ]
 """Those of gsplat 1.5.3's `test_rasterization`, and with expected depth."""
@@ -207,7 +207,7 @@ def test_absolute_gradients_are_summed_over_pixels(backend, packed, mode):
     splats, colors, (viewmats, Ks) = gaussians(dtype=dtype), colours(False, 3, dtype=dtype), cameras(dtype=dtype)
     call = {"sh_degree": 3, "packed": packed, "backend": backend, "render_mode": mode}
     image, _, info = drawn(splats, colors, viewmats, Ks, absgrad=True, **call)
-    weights, rows, columns = torch.zeros_like(image), range(1, HEIGHT, 3), range(0, WIDTH, 3)
+    weights, rows, columns = torch.zeros_like(image), range(1, HEIGHT, 5), range(0, WIDTH, 4)
     some = weights[:, rows.start :: rows.step, columns.start :: columns.step]
     some.copy_(torch.randn(some.shape, dtype=dtype, generator=torch.Generator().manual_seed(5)))
     (image * weights).sum().backward(retain_graph=True)
