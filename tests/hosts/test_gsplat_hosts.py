@@ -11,11 +11,9 @@ import pytest
 import torch
 
 from clear_strategies.data.ply import read_gaussians
-from tests.helpers.host_parts import FROM_START
 from tests.helpers.real_hosts import HOSTS, checkout, clear, counts, run, stereo_points
 
 STEPS = 30
-END = "    cli(main, cfg, verbose=True)\n"
 
 
 @pytest.fixture(params=["gsplat-1.5.3", "gsplat-1.6.0"])
@@ -80,20 +78,6 @@ def test_it_starts_from_stereo_between_its_photos(host, scene, tmp_path):
     assert "points=stereo has no effect with init_type=random" in random
 
 
-def test_one_line_does_the_same_as_none(host, scene, tmp_path):
-    text = (host / "examples" / "simple_trainer.py").read_text()
-    assert text.count(END) == 1
-    line = f"    install(Runner, sr={str(scene / 'sr')!r}, overrides={FROM_START!r})\n"
-    edited = tmp_path / "edited.py"
-    edited.write_text(text.replace(END, f"    from integration.gsplat import install\n{line}{END}"))
-    start(host, edited, "default", *training(scene, tmp_path / "one"))
-    launched(host, scene, tmp_path / "none")
-    one, none = stored(tmp_path / "one"), stored(tmp_path / "none")
-    assert all(torch.allclose(one[name], none[name], atol=1e-4) for name in none)
-    file = next((tmp_path / "one" / "ckpts").glob("*.pt"))
-    assert "PSNR" in start(host, edited, "default", *training(scene, tmp_path / "again"), "--ckpt", file)
-
-
 @pytest.mark.parametrize("option", ["--packed", "--sh-fp16", "--pose-opt", "--strategy.absgrad"])
 def test_other_ways_to_draw_train_and_densify(host, scene, tmp_path, option):
     if option == "--sh-fp16" and host.name == "gsplat-1.5.3":
@@ -103,12 +87,6 @@ def test_other_ways_to_draw_train_and_densify(host, scene, tmp_path, option):
     assert counts(said)["merges"] == STEPS
     assert counts(said)["structure changes"] >= 1
     assert {p.dtype for p in stored(tmp_path / "run").values()} == {torch.float32}
-
-
-def test_what_needs_cuda_is_refused_before_the_scene_is_read(host, scene, tmp_path):
-    said = launched(host, scene, tmp_path / "run", "mcmc", "--with-ut", "--with-eval3d", status=2)
-    assert "needs CUDA" in said
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("options", ["default", "mcmc", "default --packed --visible-adam", "default --strategy.absgrad",

@@ -15,7 +15,6 @@ import torch
 from PIL import Image
 
 from clear_strategies.data.ply import read_gaussians
-from tests.helpers.host_parts import FROM_START
 from tests.helpers.real_hosts import checkout, clear, counts, hide_half, run, spoil_half, stereo_points
 
 HOSTS = {
@@ -28,7 +27,6 @@ TRAINING = {
     "iterations": 30, "densify_from_iter": 5, "densification_interval": 5, "densify_until_iter": 25, "test_iterations": 30,
     "checkpoint_iterations": 20, "densify_grad_threshold": 1e-5,
 }  # fmt: skip
-SETUP = "    gaussians.training_setup(opt)\n"
 
 
 @pytest.fixture(params=HOSTS)
@@ -78,24 +76,6 @@ def test_it_starts_from_stereo_between_its_photos(host, scene, tmp_path):
     assert f"Number of points at initialisation :  {stereo_points(said)}" in said
     assert "30 merges" in said
     assert len(cloud(tmp_path / "model")) == stereo_points(said)
-
-
-def test_one_line_in_train_py_does_the_same(host, scene, tmp_path):
-    text = (host / "train.py").read_text()
-    assert text.count(SETUP) == 1
-    line = f"    install(gaussians, scene, opt, sr={str(scene / 'sr')!r}, overrides={FROM_START!r})\n"
-    paths = f"import sys; sys.path.insert(0, {str(host)!r})\nfrom integration.inria import install\n"
-    edited = tmp_path / "edited.py"
-    edited.write_text(paths + text.replace(SETUP, SETUP + line))
-    run(host, edited, "-s", scene, "-m", tmp_path / "edited", *training(host))
-    launched(host, scene, tmp_path / "launched")
-    one, none = cloud(tmp_path / "edited"), cloud(tmp_path / "launched")
-    assert len(one) == len(none)
-    assert float((one.sh0 - none.sh0).abs().max()) < 1e-4
-    checkpoint = tmp_path / "edited" / "chkpnt20.pth"
-    resumed = training(host, start_checkpoint=checkpoint)
-    run(host, edited, "-s", scene, "-m", tmp_path / "resumed", *resumed)
-    assert len(cloud(tmp_path / "resumed")) == len(one)
 
 
 def test_its_own_render_py_shows_what_training_evaluated(host, scene, tmp_path):

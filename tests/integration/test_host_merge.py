@@ -326,16 +326,6 @@ def test_parameters_whose_columns_lie_together_have_the_same_merged_gradients():
         torch.testing.assert_close(grads[1][name], g)
 
 
-def test_dense_gradients_are_the_factors_product():
-    like = {name: torch.zeros(N, *SHAPES[name]) for name in ("sh0", "shN", "means")}
-    colour = Colour(torch.rand(N, 3), torch.rand(N, 9))
-    g = dense(Grads({"means": torch.ones(N, 3), "quats": torch.ones(N, 4)}, colour=colour), like)
-    assert isinstance(g, Grads)
-    assert set(g) == set(like)
-    assert torch.equal(g["shN"][:, :8], colour.basis[:, 1:, None] * colour.rgb[:, None])
-    assert not g["shN"][:, 8:].any()
-
-
 class PulledByTheMeans(Strategy):
     """Adds a gradient of one parameter that follows from another."""
 

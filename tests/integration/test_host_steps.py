@@ -102,13 +102,12 @@ def test_optimizers_that_are_none_of_torchs_step_without_hooks():
     assert clear.attachment.counts["merges"] == clear.attachment.t == 2
 
 
-@pytest.mark.parametrize("wrapped", [False, True])
-def test_a_step_with_a_closure_that_renders_has_the_same_bits(wrapped):
+def test_a_step_with_a_closure_that_renders_has_the_same_bits():
     """As in PyTorch Lightning, which gives each optimizer a closure, and wraps it in an object that holds it as `optimizer`."""
 
-    def trained(gives_closure, wrapped=False):
+    def trained(gives_closure):
         host, clear, render = started(GCO(), SVS(), toy.ShowsDark())
-        for name, o in host.optimizers.items() if wrapped else ():
+        for name, o in host.optimizers.items() if gives_closure else ():
             inner = {"step": o.step, "zero_grad": o.zero_grad, "param_groups": o.param_groups}
             host.optimizers[name] = SimpleNamespace(optimizer=o, **inner)
         for i in range(4):
@@ -127,7 +126,7 @@ def test_a_step_with_a_closure_that_renders_has_the_same_bits(wrapped):
                 o.zero_grad()
         return host.splats, clear.attachment.t, clear.attachment.counts
 
-    (splats, *rest), (expected, *of_loop) = trained(True, wrapped), trained(False)
+    (splats, *rest), (expected, *of_loop) = trained(True), trained(False)
     assert rest == of_loop
     assert all(torch.equal(p, expected[name]) for name, p in splats.items())
 
@@ -146,36 +145,29 @@ def test_an_optimizer_that_calls_its_closure_several_times_is_refused():
         optimizer.step(closure)
 
 
-def test_f_det_is_a_group_of_the_only_optimizer_unless_a_scheduler_counts_the_groups():
-    scene = toy.scene(20)
-    for scheduled in (False, True):
-        host = Host(scene)
-        groups = [{"params": [p], "name": name} for name, p in host.splats.items()]
-        only = torch.optim.Adam(groups, **ADAM)
-        clear = Conductor(GCO(), objective=HR_FROM_START)
-        if scheduled:
-            schedule = torch.optim.lr_scheduler.LambdaLR(only, lambda _: 1.0)
-            with pytest.raises(SettingError, match=r"Make the scheduler after attach\(\)"):
-                attach(host.splats, only, scene.train, clear)
-            attach(host.splats, only, scene.train, clear, detail=False)
-        else:
-            attach(host.splats, only, scene.train, clear)
-            schedule = torch.optim.lr_scheduler.LambdaLR(only, lambda _: 1.0)
-            assert only.param_groups[-1]["name"] == "detail"
-        schedule.step()
-
-
-@pytest.mark.parametrize("joined", [True, False])
-def test_f_det_is_stepped_by_the_only_optimizer_of_several_parameters_else_by_one_of_its_own(joined):
+@pytest.mark.parametrize("form", ["alone", "in a dictionary", "of the means alone"])
+def test_f_det_is_a_group_of_the_only_optimizer_of_several_parameters_else_it_has_one_of_its_own(form):
     scene = toy.scene(20)
     host = Host(scene)
-    first = torch.optim.Adam([*host.splats.values()] if joined else [host.splats["means"]])
-    optimizers = {"first": first}
+    only = torch.optim.Adam([host.splats["means"]] if form == "of the means alone" else [*host.splats.values()], **ADAM)
+    optimizers = only if form == "alone" else {"first": only}
     attach(host.splats, optimizers, scene.train, Conductor())
-    assert (optimizers["detail"] is first) == joined  # where gsplat's densifiers look for it
-    group = optimizers["detail"].param_groups[-1]
+    stepping = only if form == "alone" else optimizers["detail"]  # where gsplat's densifiers look for it
+    assert (stepping is only) == (form != "of the means alone")
+    group = stepping.param_groups[-1]
     assert [id(p) for p in group["params"]] == [id(host.splats["detail"])]
     assert group["eps"] == DETAIL_EPS
+
+
+def test_f_det_is_no_group_of_an_optimizer_whose_scheduler_counts_the_groups():
+    scene = toy.scene(20)
+    host = Host(scene)
+    only = torch.optim.Adam([*host.splats.values()], **ADAM)
+    schedule = torch.optim.lr_scheduler.LambdaLR(only, lambda _: 1.0)
+    with pytest.raises(SettingError, match=r"Make the scheduler after attach\(\)"):
+        attach(host.splats, only, scene.train, Conductor())
+    attach(host.splats, only, scene.train, Conductor(), detail=False)
+    schedule.step()
 
 
 def frozen(host, render):

@@ -545,12 +545,6 @@ def test_save_lr_writes_the_photos_as_they_are_trained_on_and_stops(inria_captur
     assert Image.open(written[0]).size == (24, 16)
 
 
-def test_each_of_two_models_that_a_script_trains_has_the_strategies(inria_host, inria_launched, caplog):
-    assert inria_launched("--iterations", "4", change=(TRAINING, 2 * TRAINING)) == 0
-    assert caplog.text.count("4 merges") == 2
-    assert not hasattr(inria_host.render, "__wrapped__")
-
-
 @pytest.mark.parametrize("named", [["render_fastgs"], ["render_a", "render_b"]])
 def test_a_renderer_of_another_name_is_found_if_it_is_the_only_one(
     named, inria_host, inria_launched, caplog, monkeypatch
@@ -598,47 +592,34 @@ def test_another_method_that_sets_a_model_up_is_known_by_its_name(
     assert inria_host.GaussianModel.training_setup_pp is training_setup_pp
 
 
-def test_a_setup_of_an_earlier_stage_that_takes_no_options_is_the_hosts_own(
-    inria_host, inria_launched, caplog, monkeypatch
-):
-    """SCGaussian's, of an optimizer before the Gaussians are made."""
-    monkeypatch.setattr(inria_host.GaussianModel, "training_setup_init", lambda self: None, raising=False)
-    change = SETUP, f"gaussians.training_setup_init()\n    {SETUP}"
-    assert inria_launched("--iterations", "4", change=change) == 0
-    assert "4 merges" in caplog.text
-
-
-def test_an_object_that_has_kept_render_since_before_the_setup_draws_with_the_strategies(
-    inria_host, inria_launched, caplog
-):
-    """As EDGS's does."""
-    change = SETUP, f"global render\n    kept = render\n    {SETUP}\n    render = kept"
-    assert inria_launched("--iterations", "4", change=change) == 0
-    assert "4 merges" in caplog.text
-    assert "4 HR renders" in caplog.text
-
-
-def test_the_hosts_own_function_draws_without_the_strategies(inria_host, inria_launched, caplog):
-    own = "render.__wrapped__(camera, gaussians, pipe, background)"
-    change = "package = render(", f"unpaired = {own}\n        package = render("
-    assert inria_launched("--iterations", "4", change=change) == 0
-    assert "4 LR renders, 4 merges" in caplog.text
-
-
+OWN = "render.__wrapped__(camera, gaussians, pipe, background)"
 DECORATED = """import gaussian_renderer
 before = gaussian_renderer.render
 def decorated(*args):
     return before(*args)
 gaussian_renderer.render = render = decorated
-"""
 
 
-def test_a_script_may_put_a_function_of_its_own_in_place_of_render(inria_host, inria_launched, caplog, monkeypatch):
-    monkeypatch.setattr(sys.modules["gaussian_renderer"], "render", inria_host.render)  # the script changes it
-    change = "def photometric", f"{DECORATED}\n\ndef photometric"
+def photometric"""
+SCRIPTS = {
+    "trains two models": ((TRAINING, 2 * TRAINING), 2),
+    "sets up an earlier stage without options, as SCGaussian": ((SETUP, f"gaussians.training_setup_init()\n    {SETUP}"), 1),
+    "keeps render since before the setup, as EDGS": (
+        (SETUP, f"global render\n    kept = render\n    {SETUP}\n    render = kept"), 1
+    ),
+    "draws by its own function, too": (("package = render(", f"unpaired = {OWN}\n        package = render("), 1),
+    "puts a function of its own in place of render": (("def photometric", DECORATED), 1),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_each_model_has_the_strategies_where_a_script(script, inria_host, inria_launched, caplog, monkeypatch):
+    monkeypatch.setattr(sys.modules["gaussian_renderer"], "render", inria_host.render)  # which the script may change
+    monkeypatch.setattr(inria_host.GaussianModel, "training_setup_init", lambda self: None, raising=False)
+    change, models = SCRIPTS[script]
     assert inria_launched("--iterations", "4", change=change) == 0
-    assert "4 merges" in caplog.text
-    assert "4 HR renders" in caplog.text
+    assert caplog.text.count("4 HR renders, 4 LR renders, 4 merges") == models
+    assert not hasattr(inria_host.render, "__wrapped__")
 
 
 def test_a_model_that_would_train_without_the_strategies_is_refused_at_its_first_rendering(
