@@ -306,9 +306,7 @@ class Attached:
 
     def _save_with_detail(self, save: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """`save_ply` with f_det in the colours of the file."""
-        trained = self._model._features_dc
-        shown = torch.nn.Parameter(trained.detach() + sh0_offset(self.detail.value.detach(), trained))
-        with replaced_attribute(self._model, "_features_dc", shown):
+        with self._showing(None, self.detail.value.detach()):
             return save(*args, **kwargs)
 
 

@@ -128,6 +128,22 @@ def test_a_loop_that_trains_what_follows_the_picture_may_freeze_all_gaussians(fu
     torch.testing.assert_close(gain.grad, image.mean((0, 1)) / 3)
 
 
+def learned(running, function):
+    """The gradients of a step that draws by this function in the loop's place."""
+    photo = scene().train[0].lr
+    image = pictures(running.loop, running.clear.wrap(function), running.tensors(), [])(photo)[0]
+    image[0].mul_(0.9)  # a loop may write to what it gets
+    photometric(image[0], photo.image).backward()
+    return {name: p.grad for name, p in running.tensors().items() if p.grad is not None}
+
+
+def require_same(found, expected, caplog):
+    assert found.keys() == expected.keys() >= {"gain"}
+    for name, g in expected.items():
+        torch.testing.assert_close(found[name], g, rtol=1e-3, atol=1e-6 * float(g.abs().max()), msg=name)
+    assert "learn from LR alone" not in caplog.text
+
+
 PICTURES = {
     "masked in place": (lambda draw: draw().mul_(0.5), lambda draw: 0.5 * draw()),
     "drawn twice": (lambda draw: 0.5 * draw() + 0.5 * draw(), lambda draw: draw()),
@@ -145,17 +161,9 @@ def test_colours_of_the_means_count_once_and_a_gain_learns_from_hr_where_no_sing
             image = picture(lambda: found.append(autograd.rasterization(*args, **call)) or found[-1][0])
             return image, *found[-1][1:]
 
-        running = Running(Loop(colours="by the means", opacities="faded"))
-        photo = scene().train[0].lr
-        image = pictures(running.loop, running.clear.wrap(drawn), running.tensors(), [])(photo)[0][0]
-        photometric(image, photo.image).backward()
-        return {name: p.grad for name, p in running.tensors().items() if p.grad is not None}
+        return learned(Running(Loop(colours="by the means", opacities="faded")), drawn)
 
-    found, expected = map(gradients, PICTURES[made])
-    assert found.keys() == expected.keys() >= {"gain"}
-    for name, g in expected.items():
-        torch.testing.assert_close(found[name], g, rtol=1e-3, atol=1e-6 * float(g.abs().max()), msg=name)
-    assert "learn from LR alone" not in caplog.text
+    require_same(*map(gradients, PICTURES[made]), caplog)
 
 
 @needs("cpp")
@@ -169,18 +177,11 @@ def test_parameters_and_a_gain_that_the_function_itself_reads_learn_from_both_sc
             renders, _, info = FUNCTIONS["another"](means, quats, scales, made, colors, *view, **call)
             return renders, None, info  # not every function has alphas
 
-        photo = scene().train[0].lr
-        image = pictures(running.loop, running.clear.wrap(drawn), running.tensors(), [])(photo)[0]
-        image[0].mul_(0.9)  # a loop may write to what it gets
-        photometric(image[0], photo.image).backward()
-        return {name: p.grad for name, p in running.tensors().items() if p.grad is not None}
+        return learned(running, drawn)
 
     expected = gradients("faded", lambda p, opacities: opacities)
     found = gradients(given, lambda p, opacities: p["opacities"].sigmoid() * p["gain"])
-    assert found.keys() == expected.keys() >= {"gain"}
-    for name, g in expected.items():
-        torch.testing.assert_close(found[name], g, rtol=1e-3, atol=1e-6 * float(g.abs().max()), msg=name)
-    assert "learn from LR alone" not in caplog.text
+    require_same(found, expected, caplog)
 
 
 @pytest.mark.parametrize("name", [ROWS, "detail"])
