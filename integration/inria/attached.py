@@ -200,18 +200,18 @@ class Attached:
         """A context in which the model has opacities times the gate, and f_base + f_det. All forks activate opacities by this
         function, whatever else their getters do with them. What renders inside of a rendering is the host's own.
         """
-        model, used = self._model, []
+        model, used = self._model, set[str]()
+        activate: Any = getattr(model, "opacity_activation", None)
 
-        def gated(x: Tensor) -> Tensor:
+        def gated(x: Tensor) -> Any:
             if gate is None or x is not model._opacity:
-                return activated(x)
-            used.append(x)
-            return activated(x) * gate.to(x).view(-1, *[1] * (x.dim() - 1))
+                return activate(x)
+            used.add("gate")
+            return activate(x) * gate.to(x).view(-1, *[1] * (x.dim() - 1))
 
-        activated = getattr(model, "opacity_activation", None)
         with ExitStack() as shown:
             shown.enter_context(replaced_attribute(self, "_is_showing", True))
-            if gate is not None and activated is not None:
+            if gate is not None and activate is not None:
                 shown.enter_context(replaced_attribute(model, "opacity_activation", gated))
             if detail is not None:
                 colours = model._features_dc + sh0_offset(detail, model._features_dc)

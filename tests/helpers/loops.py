@@ -181,8 +181,8 @@ CHOICES = {
 
 
 def of_any_two_parts() -> list[Loop]:
-    """Random loops in which all parts that can meet do so by two and two, about a sixth of each loop's parts the ordinary ones. Each
-    is the one of forty in which most parts meet for the first time.
+    """Random loops in which all parts that can meet do so by two and two, about a sixth of each loop's parts the ordinary ones.
+    Each is the one of forty in which most parts meet for the first time.
     """
     chance = random.Random(0)  # noqa: S311
 
