@@ -160,6 +160,7 @@ def test_the_noise_of_mcmc(lanes):
 
 
 @needs("warp")
+@pytest.mark.parametrize("ptx_of", [120], indirect=True)
 def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
     from clear_strategies.kernels.per_gaussian import warp
 

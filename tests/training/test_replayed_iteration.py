@@ -36,7 +36,7 @@ from tests.helpers.short_run import SCENE, tensors, with_depth
 from tests.training.test_resume import without_time
 
 pytestmark = needs("warp")
-ROUND = 25  # iterations between changes of the structure
+ROUND = 12  # iterations between changes of the structure
 FIRST = "the first of its kind"
 FAILED = "a recording failed"
 
@@ -51,28 +51,28 @@ DEVICE = torch.device("cpu")
 
 
 def start(
-    *more: cs.Strategy, iterations: int = 250, density: bool = True, scene: Scene = SCENE, rises_at: int | None = None,
-    degree_every: int = 75, scores_from: int = 1, reconciles: cs.Strategy | None = None, **of_svs: Any,
+    *more: cs.Strategy, iterations: int = 120, density: bool = True, scene: Scene = SCENE, rises_at: int | None = None,
+    degree_every: int = 36, scores_from: int = 1, reconciles: cs.Strategy | None = None, **of_svs: Any,
 ) -> TrainState:  # fmt: skip
     """A training of everything that `best` is made of, over which λ_HR rises and falls, and with an anchor."""
     from clear_strategies.kernels.gaussian_step.warp import WarpGaussianStep
 
     if rises_at is None:
-        rises_at = 20 if density else 1  # HR takes part from the second iteration on, by its score or by its gradient
+        rises_at = 10 if density else 1  # HR takes part from the second iteration on, by its score or by its gradient
     objective = cs.Objective(
-        lambda_hr=WarmupDecay(final=0.1, start=rises_at, full=60, decay_from=200, end=250), kernels="warp"
+        lambda_hr=WarmupDecay(final=0.1, start=rises_at, full=30, decay_from=96, end=120), kernels="warp"
     )
-    defaults = {"dropout": Ramp(full=100), "anchor_start": 150, "anchor_weights": {"means": 1.0}}
+    defaults = {"dropout": Ramp(full=48), "anchor_start": 72, "anchor_weights": {"means": 1.0}}
     svs = cs.SVS(looks=0, anchor_strength=0.01, **(defaults | of_svs))
     conductor = cs.Conductor(reconciles or cs.GCO(), cs.P2G(), svs, *more, objective=objective, statistics_from=1)
     state = TrainState.start(
         with_depth(scene).to(DEVICE), conductor,
         settings=FitSettings(iterations=iterations, scale_schedule=False, degree_every=degree_every, seed=5),
         density=DensitySettings(
-            start=1, stop=150 if density else 2, statistics_from=scores_from, every=ROUND, reset_every=60, threshold=1e-5,
+            start=1, stop=72 if density else 2, statistics_from=scores_from, every=ROUND, reset_every=30, threshold=1e-5,
             max_gaussians=80,
         ),
-        rates=LearningRates(means=LogLinear(end=250), detail_decay=0.01, cool_from=225, end=250),
+        rates=LearningRates(means=LogLinear(end=120), detail_decay=0.01, cool_from=108, end=120),
         mip=MipFilter(every=15, last=1),
     )  # fmt: skip
     state.compiled_step = CompiledStep(conductor, state.optimizer, passes=WarpGaussianStep)
@@ -118,13 +118,13 @@ def live_in(state: TrainState) -> dict[str, int]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("moves", "until", "replays"), [("density", 250, 300), ("mcmc", 160, 180)])
+@pytest.mark.parametrize(("moves", "until", "replays"), [("density", 120, 100), ("mcmc", 78, 50)])
 def test_a_whole_training_of_replays_has_the_bits_of_a_live_one(moves, until, replays):
     """Of MCMC until after its last move; what comes later is the same in both."""
 
     def best():
         more = [cs.PseudoViews(count=8, reach=0.1), cs.FadingOpacity(rate=0.002), cs.RandomBackground(until=1_350)]
-        return start(*more, *([MCMC(start=ROUND, stop=150, every=ROUND, per_point=3.0)] if moves == "mcmc" else []))
+        return start(*more, *([MCMC(start=ROUND, stop=72, every=ROUND, per_point=3.0)] if moves == "mcmc" else []))
 
     replayed = both(best, until)
     assert replays_of(replayed) > replays  # of as many views as iterations, and half as many extra views
