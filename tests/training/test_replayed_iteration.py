@@ -13,6 +13,7 @@ import torch
 import clear_strategies as cs
 import rasterizers
 from clear_strategies.core import work_log
+from clear_strategies.core.step import Step
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
@@ -169,28 +170,6 @@ class Late(Ramp):
         return 0.2 if t >= 6 else 0.0
 
 
-OF_TWO_SIZES = replace(SCENE, train=tuple(cropped(v, 2 * (k == 1)) for k, v in enumerate(SCENE.train)))
-KINDS = {
-    "masks": lambda: start(
-        density=False, scene=replace(SCENE, train=tuple(masked(v, 3 * k) for k, v in enumerate(SCENE.train)))
-    ),
-    "size of the photos": lambda: start(density=False, scene=OF_TWO_SIZES),
-    "robust": lambda: start(toy.Shows(lambda views, t: [toy.again(views[0].lr, robust=t % 3 == 0)]), density=False),
-    "degree": lambda: start(density=False, degree_every=5),
-    "background": lambda: start(cs.RandomBackground(until=1_350), cs.FadingOpacity(rate=0.002), density=False),
-    "dropout": lambda: start(density=False, dropout=Late()),
-    "λ_HR > 0": lambda: start(density=False, rises_at=6),
-    "scores are collected": lambda: start(scores_from=6),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("differs", KINDS)
-def test_what_differs_between_iterations_is_copied_or_makes_them_of_two_kinds(differs):
-    replayed = both(KINDS[differs], 14)
-    assert replays_of(replayed) >= 7
-    assert live_in(replayed).keys() == {FIRST}
-
-
 @dataclass(frozen=True)
 class Pulls(cs.Strategy):
     """Moves all bands in iterations from `first` to `last`, with nothing stored that tells."""
@@ -202,32 +181,184 @@ class Pulls(cs.Strategy):
         return cs.Grads({"shN": 1e-3 * (1 + params["shN"])}) if self.first <= t <= self.last else None
 
 
-@pytest.mark.parametrize("on", ["an extra view", "a photo of another size"])
-def test_a_recorded_step_moves_every_band_that_has_momentum_by_then(on):
-    if on == "an extra view":
-        replayed = both(lambda: start(Pulls(8, 99), cs.PseudoViews(count=8, reach=0.1), density=False), 14)
-    else:
-        replayed = both(lambda: start(Pulls(9, 9), density=False, scene=OF_TWO_SIZES), 18)
+@dataclass(frozen=True)
+class ByTime(cs.Strategy):
+    """Decides by what is another one in a replay."""
+
+    reads: str = "t"
+
+    def reconcile(self, products, step):
+        t = step.t
+        keep = {
+            "a milestone": lambda: 0.5 if t > 8 else 1.0, "periods": lambda: 0.5 if -(-t // 5) >= 2 else 1.0,
+            "every second": lambda: 0.5 if t % 2 else 1.0, "a number": lambda: 1 / float(t),
+            "the name": lambda: 0.5 if step.view.name.endswith("1") else 1.0,
+        }  # fmt: skip
+        return cs.Weights(keep=keep[self.reads]() if self.reads in keep else 1.0)
+
+    def regularize(self, params, t):
+        return cs.Grads({"means": params["means"] / t}) if self.reads == "an anchor" else None
+
+
+@dataclass(frozen=True)
+class ByMemory(cs.Strategy):
+    """Decides by what it has stored beside its state."""
+
+    stores: str = "a count"
+
+    def reconcile(self, products, step):
+        last, q = self.cache.get("last"), step.evidence.reliability
+        if self.stores == "a count":
+            self.cache["count"] = self.cache.get("count", 0) + 1
+            return cs.Weights(keep=0.5 if self.cache["count"] % 4 == 0 else 1.0)
+        if self.stores == "what it was given":
+            self.cache["last"] = q
+            return cs.Weights() if last is None else cs.Weights(keep=(1 + last - q).clamp(0, 1))
+        return cs.Weights(keep=self.cache.get("weight", 1.0))
+
+    def after_step(self, params, step):
+        if self.stores == "a number after the step":
+            self.cache["weight"] = 1 / (1 + step.t // 5)
+
+
+@dataclass(frozen=True)
+class ByMean(cs.Strategy):
+    """Keeps of HR what a running mean says, a number of the run."""
+
+    in_place: bool = True
+
+    def on_fit_start(self, n_views, seed):
+        self.state["mean"] = torch.ones(())
+
+    def reconcile(self, products, step):
+        return cs.Weights(keep=self.state["mean"].double())
+
+    def after_step(self, params, step):
+        if step.evidence is not None:
+            mean = 0.9 * self.state["mean"] + 0.1 * step.evidence.reliability.mean()
+            self.state["mean"] = self.state["mean"].copy_(mean) if self.in_place else mean
+
+
+@dataclass(frozen=True)
+class Remembers(cs.Strategy):
+    """Moves opacities by how the evidence has changed since the last iteration, whose tensors it has stored."""
+
+    def after_step(self, params, step):
+        if (last := self.cache.get("last")) is not None:
+            change = step.evidence.reliability - last.evidence.reliability
+            params["opacities"].add_(0.1 * change + 0.1 * (step.visible ^ last.visible))
+        self.cache["last"] = None if step.evidence is None else step
+
+
+def fixed(*more: cs.Strategy, **settings: Any) -> Callable[[], TrainState]:
+    """A training without density control."""
+    return lambda: start(*more, density=False, **settings)
+
+
+def by(strategy: cs.Strategy) -> Callable[[], TrainState]:
+    """A training that this strategy reconciles from the second iteration on."""
+    return fixed(reconciles=strategy, rises_at=2)
+
+
+OF_TWO_SIZES = replace(SCENE, train=tuple(cropped(v, 2 * (k == 1)) for k, v in enumerate(SCENE.train)))
+MASKED = replace(SCENE, train=tuple(masked(v, 3 * k) for k, v in enumerate(SCENE.train)))
+BESIDE = cs.PseudoViews(count=8, reach=0.1)
+KINDS = {
+    "masks": (fixed(scene=MASKED), 14),
+    "size of the photos": (fixed(scene=OF_TWO_SIZES), 14),
+    "robust": (fixed(toy.Shows(lambda views, t: [toy.again(views[0].lr, robust=t % 3 == 0)])), 14),
+    "degree": (fixed(degree_every=5), 14),
+    "background": (fixed(cs.RandomBackground(until=1_350), cs.FadingOpacity(rate=0.002)), 14),
+    "dropout": (fixed(dropout=Late()), 14),
+    "λ_HR > 0": (fixed(rises_at=6), 14),
+    "scores are collected": (lambda: start(scores_from=6), 14),
+    "bands that an extra view moves": (fixed(Pulls(8, 99), BESIDE), 14),
+    "bands that have momentum when a photo of another size comes": (fixed(Pulls(9, 9), scene=OF_TWO_SIZES), 18),
+    "an anchor, and an extra view": (fixed(BESIDE, anchor_start=5, anchor_weights=cs.SVS().anchor_weights), 16),
+    **{f"GCO {settings}": (by(cs.GCO(**settings)), 12) for settings in (
+        {"groups": ("means", "sh0")}, {"whole": True}, {"drop": True}
+    )},
+    "a milestone": (by(ByTime("a milestone")), 14),
+    "periods": (by(ByTime("periods")), 14),
+    "a number after the step": (by(ByMemory("a number after the step")), 16),
+    "a number of the run that is written in place": (by(ByMean()), 12),
+    "what a strategy keeps of an iteration": (fixed(Remembers(), rises_at=2), 12),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("differs", KINDS)
+def test_what_differs_between_iterations_is_copied_or_decides_which_recording_is_replayed(differs):
+    make, until = KINDS[differs]
+    replayed = both(make, until)
     assert replays_of(replayed) >= 7
     assert live_in(replayed).keys() == {FIRST}
 
 
-def test_an_anchored_step_and_that_of_an_extra_view_are_both_recorded():
-    """Which bands have momentum is asked of the device once."""
-    replayed = both(
-        lambda: start(
-            cs.PseudoViews(count=8, reach=0.1), density=False, anchor_start=5, anchor_weights=cs.SVS().anchor_weights
-        ), 16,
-    )  # fmt: skip
-    assert replays_of(replayed) >= 12
-    assert live_in(replayed).keys() == {FIRST}
+@pytest.mark.parametrize("reads", ["every second", "a number", "the name", "an anchor"])
+def test_a_strategy_that_reads_the_iteration_or_the_view_is_live(reads, caplog):
+    """tests/rasterizers/test_guards.py has more ways to read them."""
+    replayed = both(by(ByTime(reads)), 16)
+    assert live_in(replayed)[FAILED] >= 2
+    assert "must not read the" in caplog.text or "decides by the iteration" in caplog.text
 
 
-@pytest.mark.parametrize("settings", [{"groups": ("means", "sh0")}, {"whole": True}, {"drop": True}])
-def test_every_correction_of_conflicts_is_recorded(settings):
-    replayed = both(lambda: start(reconciles=cs.GCO(**settings), density=False, rises_at=2), 10)
-    assert replays_of(replayed) >= 5
-    assert live_in(replayed).keys() == {FIRST}
+def test_of_a_view_a_strategy_may_read_in_a_recording_what_every_replay_copies(monkeypatch):
+    """The images, unless a background that changes shows through them."""
+
+    def transparent(photo: Photo) -> Photo:
+        return replace(photo, transparency=1 - photo.image.mean(dim=2))
+
+    monkeypatch.setattr("clear_strategies.merging.conductor.running", lambda: SimpleNamespace(guards=[]))
+    monkeypatch.setattr("rasterizers.guards.running", lambda: SimpleNamespace(guards=[]))
+    view = with_depth(SCENE).train[0]
+    step = Step(3, replace(view, lr=transparent(view.lr), disagreement=torch.zeros_like(view.lr.image)))
+    changing, plain = (cs.Conductor(*s)._told(step).view for s in ([cs.RandomBackground()], []))
+    refused = {
+        "name": lambda v: v.name[0], "sr_source": lambda v: v.sr_source == "made", "camera": lambda v: v.hr.camera.cx,
+        "depth": lambda v: v.depth.confidence, "disagreement": lambda v: v.disagreement.mean(),
+        "truth": lambda v: v.truth.mean(), "transparency": lambda v: v.lr.transparency.mean(),
+    }  # fmt: skip
+    for what, read in refused.items():
+        for shown in (changing, plain):
+            with pytest.raises(RuntimeError, match=f"must not read the {what} of the view"):
+                read(shown)
+    with pytest.raises(RuntimeError, match="must not read the transparent image of the view"):
+        changing.lr.image.mean()
+    assert torch.equal(plain.lr.image, step.view.lr.image)
+    assert torch.equal(changing.hr.image, view.hr.image)
+    assert (changing.lr.image.shape, changing.lr.camera.width) == (view.lr.image.shape, view.lr.camera.width)
+
+
+@pytest.mark.parametrize("stores", ["a count", "what it was given"])
+def test_what_a_strategy_decides_by_what_it_stores_in_python_is_live(stores, caplog):
+    both(by(ByMemory(stores)), 16)
+    require_one_line(caplog, 13)
+    assert "by what it stores" in caplog.text
+
+
+def test_a_number_of_the_run_that_is_another_tensor_each_time_is_live():
+    assert "replayed" not in both(by(ByMean(in_place=False)), 12).conductor.work_log.entries
+
+
+@pytest.mark.parametrize(
+    ("stores", "changes"),
+    [
+        (lambda s: s.cache.setdefault("list", []), lambda x: x.append(1)),
+        (lambda s: s.cache.setdefault("own", SimpleNamespace(count=0)), lambda x: setattr(x, "count", 1)),
+        (lambda s: s.cache.setdefault("of tensors", [torch.ones(3)]), lambda x: x.__setitem__(0, torch.ones(3))),
+        (lambda s: s.state["mean"], lambda x: x.mul_(0.5)),
+    ],
+    ids=["a list", "an attribute of its own class", "a new tensor", "a number of the run that the host reads"],
+)
+def test_what_a_strategy_stores_in_python_is_compared_by_what_it_holds(stores, changes, monkeypatch):
+    monkeypatch.setattr(replay, "can_record", lambda device: False)
+    strategy = ByMean()
+    strategy.on_fit_start(1, 0)
+    stored = stores(strategy)
+    before = _stored_by(strategy)
+    assert _stored_by(strategy) == before
+    changes(stored)
+    assert _stored_by(strategy) != before
 
 
 def test_stages_are_timed_by_events_and_none_in_a_recording(monkeypatch):
@@ -310,171 +441,6 @@ def test_memory_that_is_new_in_each_iteration_is_told_and_not_recorded(caplog):
     found = [kept.do(ReplayKey(1, (k,), (), ()), k, [], live=lambda: "live", record=fails) for k in range(30)]
     assert set(found) == {"live"}
     assert caplog.text.count("Write to Strategy.state in place") == 1
-
-
-@dataclass(frozen=True)
-class ByTime(cs.Strategy):
-    """Decides by what is another one in a replay."""
-
-    reads: str = "t"
-
-    def reconcile(self, products, step):
-        t, name = step.t, step.view.name
-        keep = {
-            "a milestone": lambda: 0.5 if t > 8 else 1.0, "periods": lambda: 0.5 if -(-t // 5) >= 2 else 1.0,
-            "every second": lambda: 0.5 if t % 2 else 1.0, "a number": lambda: 1 / float(t),
-            "a tensor": lambda: 0.5 + 0.5 * (t > torch.ones(len(products.dot))),
-            "the name": lambda: 0.5 if name.endswith("1") else 1.0,
-            "a text": lambda: 0.5 if f"{self.seed}-{t}".endswith("5") else 1.0,
-            "the camera": lambda: step.view.hr.camera.cx / 100,
-            "the depth": lambda: 1.0 if step.view.depth is None else step.view.depth.confidence.mean().double() / 2,
-            "the prior": lambda: 0.5 if step.view.sr_source == "made" else 1.0,
-        }  # fmt: skip
-        return cs.Weights(keep=keep[self.reads]() if self.reads in keep else 1.0)
-
-    def regularize(self, params, t):
-        return cs.Grads({"means": params["means"] / t}) if self.reads == "an anchor" else None
-
-
-@pytest.mark.parametrize("reads", ["a milestone", "periods"])
-def test_what_a_strategy_decides_by_the_iteration_holds_in_replays_or_they_are_recorded_anew(reads):
-    replayed = both(lambda: start(reconciles=ByTime(reads), density=False, rises_at=2), 14)
-    assert live_in(replayed).keys() == {FIRST}
-    assert replays_of(replayed) >= 8
-
-
-NO_GUARD = (
-    "every second", "a number", "a tensor", "the name", "an anchor", "a text", "the camera", "the depth", "the prior",
-)  # fmt: skip
-
-
-@pytest.mark.parametrize("reads", NO_GUARD)
-def test_a_strategy_that_reads_the_iteration_or_the_view_is_live(reads, caplog):
-    """tests/rasterizers/test_guards.py has more ways to read them."""
-    replayed = both(lambda: start(reconciles=ByTime(reads), density=False, rises_at=2), 16)
-    assert live_in(replayed)[FAILED] >= 2
-    assert "must not read the" in caplog.text or "decides by the iteration" in caplog.text
-
-
-@dataclass(frozen=True)
-class ByPhoto(cs.Strategy):
-    """Decides by a layer of the photo."""
-
-    layer: str
-
-    def reconcile(self, products, step):
-        layer = getattr(step.view.lr, self.layer)
-        return cs.Weights() if layer is None else cs.Weights(keep=layer.double().mean())
-
-
-@pytest.mark.parametrize(("layer", "has_alpha", "is_live"), [
-    ("image", True, True), ("image", False, False), ("transparency", True, True), ("transparency", False, False),
-])  # fmt: skip
-def test_a_strategy_that_reads_a_photo_which_a_background_shows_through_is_live(layer, has_alpha, is_live):
-    def transparent(photo: Photo) -> Photo:
-        return replace(photo, transparency=1 - photo.image.mean(dim=2))
-
-    views = tuple(replace(v, lr=transparent(v.lr), hr=transparent(v.hr), truth=None) for v in SCENE.train)
-    scene = replace(SCENE, train=views) if has_alpha else SCENE
-    replayed = both(
-        lambda: start(
-            cs.RandomBackground(until=1_350), reconciles=ByPhoto(layer), density=False, rises_at=2, scene=scene
-        ),
-        10,
-    )
-    assert (FAILED in live_in(replayed)) is is_live
-
-
-@dataclass(frozen=True)
-class ByMemory(cs.Strategy):
-    """Decides by what it has stored beside its state."""
-
-    stores: str = "a count"
-
-    def reconcile(self, products, step):
-        last, q = self.cache.get("last"), step.evidence.reliability
-        if self.stores == "a count":
-            self.cache["count"] = self.cache.get("count", 0) + 1
-            return cs.Weights(keep=0.5 if self.cache["count"] % 4 == 0 else 1.0)
-        if self.stores == "a list":
-            self.cache.setdefault("list", []).append(1)
-            return cs.Weights(keep=0.5 if len(self.cache["list"]) % 4 == 0 else 1.0)
-        if self.stores == "an attribute of its own class":
-            memory = self.cache.setdefault("memory", SimpleNamespace(count=0))
-            memory.count += 1
-            return cs.Weights(keep=0.5 if memory.count % 4 == 0 else 1.0)
-        if self.stores == "a new tensor":
-            self.cache["last"] = q.mean() if last is None else 0.9 * last + 0.1 * q.mean()
-            return cs.Weights(keep=self.cache["last"].double())
-        if self.stores == "what it was given":
-            self.cache["last"] = q
-            return cs.Weights() if last is None else cs.Weights(keep=(1 + last - q).clamp(0, 1))
-        return cs.Weights(keep=self.cache.get("weight", 1.0))
-
-    def after_step(self, params, step):
-        if self.stores == "a number after the step":
-            self.cache["weight"] = 1 / (1 + step.t // 5)
-
-
-@pytest.mark.parametrize("stores", [
-    "a count", "a list", "an attribute of its own class", "a new tensor", "what it was given", "a number after the step",
-])  # fmt: skip
-def test_what_a_strategy_decides_by_what_it_stores_holds_in_replays_or_they_are_recorded_anew(stores, caplog):
-    replayed = both(lambda: start(reconciles=ByMemory(stores), density=False, rises_at=2), 16)
-    if stores == "a number after the step":
-        assert replays_of(replayed) >= 7
-    else:
-        require_one_line(caplog, 13)
-        assert "by what it stores" in caplog.text
-
-
-@dataclass(frozen=True)
-class ByMean(cs.Strategy):
-    """Keeps of HR what a running mean says, a number of the run."""
-
-    in_place: bool = True
-
-    def on_fit_start(self, n_views, seed):
-        self.state["mean"] = torch.ones(())
-
-    def reconcile(self, products, step):
-        return cs.Weights(keep=self.state["mean"].double())
-
-    def after_step(self, params, step):
-        if step.evidence is not None:
-            mean = 0.9 * self.state["mean"] + 0.1 * step.evidence.reliability.mean()
-            self.state["mean"] = self.state["mean"].copy_(mean) if self.in_place else mean
-
-
-@pytest.mark.parametrize("in_place", [True, False])
-def test_a_number_of_the_run_is_read_where_it_lies(in_place):
-    replayed = both(lambda: start(reconciles=ByMean(in_place), density=False, rises_at=2), 12)
-    assert ("replayed" in replayed.conductor.work_log.entries) is in_place
-
-
-def test_a_number_of_the_run_that_the_host_reads_holds_as_what_a_strategy_stores_in_python(monkeypatch):
-    monkeypatch.setattr(replay, "can_record", lambda device: False)
-    strategy = ByMean()
-    strategy.on_fit_start(1, 0)
-    before = _stored_by(strategy)
-    assert _stored_by(strategy) == before
-    strategy.state["mean"].mul_(0.5)
-    assert _stored_by(strategy) != before
-
-
-@dataclass(frozen=True)
-class Remembers(cs.Strategy):
-    """Moves opacities by how the evidence has changed since the last iteration, whose tensors it has stored."""
-
-    def after_step(self, params, step):
-        if (last := self.cache.get("last")) is not None:
-            change = step.evidence.reliability - last.evidence.reliability
-            params["opacities"].add_(0.1 * change + 0.1 * (step.visible ^ last.visible))
-        self.cache["last"] = None if step.evidence is None else step
-
-
-def test_what_a_strategy_keeps_of_an_iteration_does_not_change_in_the_next_replay():
-    assert replays_of(both(lambda: start(Remembers(), density=False, rises_at=2), 12)) >= 8
 
 
 @dataclass(frozen=True)
