@@ -99,7 +99,7 @@ class Conductor(Hooks):
     @property
     def wants_lr(self) -> bool:
         """True if the LR render has any use; else Î_LR is the area mean of Î_HR."""
-        return self.objective.draws_lr
+        return self.objective.lr_from == "lr" and self.objective.lambda_lr > 0
 
     @property
     def uses_hr(self) -> bool:

@@ -64,11 +64,6 @@ class Objective:
                 f"lambda_hr.peak={self.lambda_hr.peak}, start={self.lambda_hr.start}. Set lambda_hr.start=0 and full=0."
             )
 
-    @property
-    def draws_lr(self) -> bool:
-        """True if Î_LR is rendered; else it is the area mean of Î_HR, which is then needed at every iteration."""
-        return self.lr_from == "lr" and self.lambda_lr > 0
-
     def weights(self, t: int) -> tuple[float, float]:
         """λ_HR(t) and λ_HR(t) λ_HF."""
         λ = self.lambda_hr(t)

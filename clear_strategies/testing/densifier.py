@@ -52,7 +52,7 @@ def _densified(make: Make, cut: int = 0) -> Iterator[Tensor]:
         t, field, density, conductor = state.t, state.field, state.density, state.conductor
         lr, hr, view, _ = given.situation(100 + t, len(field))
         update = conductor.update(field.raw(), lr, hr, view, t)
-        state.optimizer.step(field.raw(), given.gradient(update))
+        state.optimizer.step(field.raw(), update.grads or {})
         if density.collects(t):
             before = replace(update, grads=None)  # as from `Conductor.gradients`
             without_error("a densifier's accumulate", f"at t={t}", density.accumulate, before, hr, t)

@@ -17,7 +17,6 @@ from clear_strategies.core.step import Step
 from clear_strategies.core.view import Photo, View
 from clear_strategies.errors import AnswerError
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.merging.iteration import Update
 from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import WarmupDecay, scaled
 from clear_strategies.strategies.base import Strategy, overrides
@@ -127,8 +126,7 @@ def trace(conductor: Conductor, start: int, stop: int, n: int = N) -> Iterator[A
         yield torch.tensor(conductor.background(t) or (0.0, 0.0, 0.0))
         update = conductor.update(params, lr, hr, view, t)
         yield update.score
-        grads = gradient(update)
-        yield from (grads[name] for name in sorted(grads))
+        yield from (g for _, g in sorted((update.grads or {}).items()))
         for extra in conductor.extra_views(t):
             yield from (extra.photo.image, extra.weight)
         conductor.after_step(params, update.step)
@@ -138,8 +136,3 @@ def trace(conductor: Conductor, start: int, stop: int, n: int = N) -> Iterator[A
 def enlarged(camera: Camera, factor: int) -> Photo:
     large = camera.scaled(factor)
     return Photo(large, torch.full((large.height, large.width, 3), 0.5))
-
-
-def gradient(update: Update) -> Grads:
-    """The merged gradient, which is there after `Conductor.update`."""
-    return update.grads or Grads()

@@ -228,7 +228,7 @@ def test_without_a_gradient_the_kernel_computes_ssim_alone(name, dssim):
 @pytest.mark.parametrize(
     ("x", "y", "error", "message"),
     [
-        (torch.rand(4, 5, 3).double(), torch.rand(4, 5, 3), TypeError, "x must be float32 on the CPU, got .*float64"),
+        (torch.rand(4, 5, 3).double(), torch.rand(4, 5, 3), TypeError, "x must be float32 on cpu, .* got .*float64"),
         (torch.rand(4, 5, 3), torch.rand(4, 5, 3).half(), TypeError, "y must be float32"),
         (torch.rand(4, 5, 3), torch.rand(4, 5, 3, device="meta"), TypeError, "on meta"),
         (torch.rand(4, 5, 3), torch.rand(5, 4, 3), ValueError, "as large as x"),
@@ -239,11 +239,6 @@ def test_without_a_gradient_the_kernel_computes_ssim_alone(name, dssim):
 def test_the_compiled_kernels_refuse_other_images(x, y, error, message):
     with pytest.raises(error, match=message):  # the public functions' shape annotations would raise first under pytest
         image_pair(("cpu",), x, y, None)
-
-
-def test_images_on_different_devices_are_refused():
-    with pytest.raises(TypeError, match="y must be on cpu, where x is, got meta"):
-        image_pair(("cpu", "meta"), torch.rand(4, 5, 3), torch.rand(4, 5, 3, device="meta"), None)
 
 
 def test_auto_uses_torch_for_images_that_the_compiled_kernels_refuse():

@@ -10,7 +10,6 @@ from torch import Tensor
 
 DEVICES: Final = {"cpp": ("cpu",), "warp": ("cuda", "cpu")}
 """The devices of each compiled implementation."""
-_IN_WORDS: Final = {"cpu": "the CPU", "cuda": "CUDA"}
 
 
 def supported(*images: Tensor) -> bool:
@@ -23,26 +22,23 @@ def supported(*images: Tensor) -> bool:
 def image_pair(devices: Collection[str], x: Tensor, y: Tensor, out: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """The images as kernels for `devices` read them, contiguous and detached, and the tensor that receives the gradient.
 
+    Args:
+        out: contiguous, as large as x; None: a new one.
+
     Raises:
         TypeError: an image is not float32, or not on such a device, or not on the same device as x.
-        ValueError: an image is not [H, W, 3], or not as large as x; or `out` is not contiguous.
+        ValueError: an image is not [H, W, 3], or not as large as x.
     """
-    for name, image in (("x", x), ("y", y), ("out", out)):
-        if image is None:
-            continue
-        if image.dtype != torch.float32 or image.device.type not in devices:
+    for name, image in (("x", x), ("y", y)):
+        if image.dtype != torch.float32 or image.device.type not in devices or image.device != x.device:
             raise TypeError(
-                f"{name} must be float32 on {' or '.join(_IN_WORDS[device] for device in devices)}, got {image.dtype} on "
-                f"{image.device}; kernels=torch supports any."
+                f"{name} must be float32 on {' or '.join(devices)}, where x is, got {image.dtype} on {image.device}; "
+                "kernels=torch supports any."
             )
-        if image.device != x.device:
-            raise TypeError(f"{name} must be on {x.device}, where x is, got {image.device}.")
         if image.ndim != 3 or image.shape[2] != 3 or image.shape != x.shape or image.numel() == 0:
             raise ValueError(
                 f"{name} must be an image [H, W, 3] with pixels, and as large as x; got {tuple(image.shape)} "
                 f"beside {tuple(x.shape)}."
             )
-    gradient = torch.empty_like(x, memory_format=torch.contiguous_format, requires_grad=False) if out is None else out
-    if not gradient.is_contiguous():
-        raise ValueError(f"out must be contiguous, got strides {gradient.stride()}.")
-    return x.detach().contiguous(), y.detach().contiguous(), gradient
+    x, y = x.detach().contiguous(), y.detach().contiguous()
+    return x, y, torch.empty_like(x) if out is None else out
