@@ -21,7 +21,7 @@ _TYPES = next(Path("/usr").glob("include/**/bits/types.h"), None)  # glibc's; no
 _CLANG = next(filter(None, map(shutil.which, ("clang++", *(f"clang++-{n}" for n in range(21, 13, -1))))), None)
 _ARM64 = ("aarch64-linux-gnu-g++", "qemu-aarch64-static")
 # As CMakeLists.txt, but for speed of compilation; CLEAR_DOUBLE leaves it to the compiler what to inline.
-_FLAGS = ("-O1", "-DCLEAR_DOUBLE", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-pthread")
+_FLAGS = ("-Og", "-DCLEAR_DOUBLE", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-pthread")
 
 
 @pytest.mark.skipif(_CLANG is None, reason="not installed: clang++")

@@ -245,11 +245,9 @@ def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
     for depth in (False, True):
         ptx_of(blend.blend_pieces(depth, 64).module, 64)
         ptx_of(blend.blend(depth).module, 64)
-    for k in (1, 3):
-        for kernel in (project.fold(k), project.project_vjp(k), project.project_vjp(k, summed=k > 1)):
-            ptx_of(kernel.module)
     ptx_of(blend.blend_vjp(1, 32, True, absolute=True).module, 32)
-    for kernel in (project.fold(1, absolute=True), project.project_vjp(1, absolute=True)):
+    of_one = project.fold(1, absolute=True), project.project_vjp(1, absolute=True)
+    for kernel in (*of_one, project.fold(3), project.project_vjp(3), project.project_vjp(3, summed=True)):
         ptx_of(kernel.module)
 
 

@@ -210,19 +210,6 @@ def test_rows_and_bands_that_are_left_out_would_not_have_moved(passes, degree, a
     assert "optimizer rows" not in ledgers[1]
 
 
-def test_bands_with_momentum_are_not_left_out(passes):
-    c = case(20, degree=1)
-    both = conductors()
-    adams = [Adam(f.raw(), LearningRates(), 1.0) for f in c.fields]
-    for adam in adams:
-        adam.first["shN"][:, 10], adam.second["shN"][:, 10] = 1e-3, 1e-6
-    g, _ = readable_merge(both[0], c.fields[0].raw(), *c.grads(0), T)
-    adams[0].step(c.fields[0].raw(), g)
-    CompiledStep(both[1], adams[1], passes=passes).step(c.fields[1].raw(), *c.factors(1), T)
-    assert torch.allclose(c.fields[0].shN.data, c.fields[1].shN.data, rtol=1e-6, atol=1e-9)
-    assert bool((c.fields[1].shN.data[:, 10] != 0).all())
-
-
 @pytest.mark.parametrize(
     ("degrees", "moved", "skipped"),
     [((1, 1), {1: 10}, 12 + 4), ((2, 1), {}, 7 + 7), ((0, 1), {0: 1}, 13 + 12)],

@@ -30,7 +30,7 @@ def without_time(history: list[dict[str, float]]) -> str:
 
 
 STATES = {
-    (): SOME, ("gco",): SOME, ("p2g",): SOME, ("svs",): SOME,
+    ("gco",): SOME,
     ("gco", "p2g", "svs", "pseudo_views", "fading_opacity", "random_background"): EVERYWHERE,
 }  # fmt: skip
 
