@@ -126,10 +126,6 @@ def NO_GATE(self, t, n):
     """A hook of a strategy that has to have one beside `on_views`."""
 
 
-def assigns(params, step):
-    params["means"].data = params["means"] * 0.99
-
-
 @dataclass(frozen=True)
 class Secretive(Strategy):
     """Remembers outside `state`."""
@@ -180,7 +176,6 @@ class OfFunctions(Strategy):
         (changing("score", lambda step, screen: screen.ordinary.mul_(2)), "^screen.ordinary was changed in place"),
         (changing("regularize", lambda params, t: params["opacities"].clamp_(max=4)), "^a parameter was changed in place"),
         (answering("compare", lambda scale, image, photo, step, losses: losses(image.mul_(0.5))), "an image was changed in"),
-        (answering("after_step", assigns), r"after_step\(\) must change means in place"),
         (answering("observe", lambda step, hr: Evidence(step.visible / step.visible, step.visible.float())),
          "the evidence of reliability is not finite"),
         (answering("gate", lambda t, n: (torch.rand(n) > 0.5).float()), "derive randomness"), (Secretive, "does not continue"),
@@ -229,14 +224,11 @@ ANSWERS = {
     "regularize, meta": ("regularize", lambda p, t: {"means": p["means"].to("meta")}, "must give means as .*, got a meta tensor"),
     "route NaN": ("route", float("nan"), "must give finite numbers, but m is nan"),
     "correct": ("correct", None, "must give Grads, or a mapping from attributes to tensors, got None"),
-    "correct, weights": ("correct", Weights(), "must give Grads, or a mapping"),
     "correct, names": ("correct", lambda lr, hr, step: {"mean": hr["means"]}, "must give attributes of g_HR, .*, got 'mean'"),
     "correct, rows": (
         "correct", lambda lr, hr, step: {"means": hr["means"][:5]}, "must give means as a tensor \\[30, 3\\], got .* \\[5, 3\\]"
     ),
     "regularize": ("regularize", torch.ones(30), "must give Grads, or a mapping"),
-    "regularize, names": ("regularize", lambda p, t: {"scale": p["scales"]}, "must give attributes of the parameters"),
-    "regularize, rows": ("regularize", lambda p, t: {"scales": p["scales"].T}, "must give scales as a tensor \\[30, 3\\]"),
     "regularize, NaN": ("regularize", lambda p, t: {"means": nan_of_first(p["means"])}, "must give finite numbers, but means"),
     "score": ("score", 1.0, "must give a tensor \\[30\\] or None, got 1.0"),
     "score NaN": ("score", lambda step, screen: nan_of_first(screen.ordinary), "must give finite numbers, but S"),
