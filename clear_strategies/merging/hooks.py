@@ -219,10 +219,8 @@ class Hooks:
         Args:
             products: of g_LR and g^HR; None: HR takes no part.
         """
-        if products is None:
-            return Weights(), self.regularized(params, t, finite=finite), {}
-        conflict = products.conflict()
-        answer = self.reconciled(products, step, both, finite=finite)
+        answer = Weights() if products is None else self.reconciled(products, step, both, finite=finite)
+        conflict = {} if products is None else products.conflict()
         return answer, self.regularized(params, t, finite=finite), conflict
 
     def reconciled(

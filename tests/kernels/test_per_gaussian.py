@@ -1,7 +1,5 @@
 """C++ and Warp's kernels between the renderings and the step, on a CPU, beside what they stand for in torch."""
 
-from typing import NamedTuple
-
 import pytest
 import torch
 
@@ -14,6 +12,7 @@ from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.kernels import native
 from clear_strategies.kernels.per_gaussian import activate, evidence_score, reference, route, wander
 from clear_strategies.merging.iteration import HrSide, Update
+from clear_strategies.testing import StubShot
 from rasterizers.native import kernel_threads
 from tests.helpers import toy
 from tests.helpers.backends import needs
@@ -42,13 +41,8 @@ def both(function):
         return found, function()
 
 
-class Seen(NamedTuple):
-    means2d: torch.Tensor
-    visible: torch.Tensor
-    image: torch.Tensor = torch.zeros(1, 1, 3)
-
-    def vjp(self, cotangents):
-        raise NotImplementedError
+def seen(means2d, visible):
+    return StubShot(torch.zeros(1, 1, 3), means2d, visible, [])
 
 
 def numbers(*shape: int) -> torch.Tensor:
@@ -103,7 +97,7 @@ def test_the_evidence_and_its_routing(lanes, normalize, share):
     )
     view, centers = toy.scene().train[0], 50 + 60 * numbers(N, 2)
     centers[~visible] = torch.nan
-    shot = Seen(centers, visible)
+    shot = seen(centers, visible)
 
     def answers():
         e = p2g.observe(Step(1, view, visible), shot)
@@ -132,7 +126,7 @@ def test_scores_and_their_sum(lanes, score_by, hf):
             density = toy.densifier(DensitySettings(reduce=reduce), N)
             for factor in (1.0, 0.3):
                 density.accumulate(
-                    Update(hr.step, None, factor * score, factor * ordinary), Seen(lr.screen, visible), 1
+                    Update(hr.step, None, factor * score, factor * ordinary), seen(lr.screen, visible), 1
                 )
             found += density.state_dict().values()
         return found

@@ -355,28 +355,6 @@ class Doubles(Densifier):
         return True
 
 
-class Moves(Doubles):
-    """Moves the first Gaussian to the third, by `gathered`; then to somewhere else, as noise does."""
-
-    def __init__(self, n, gathered):
-        super().__init__(n)
-        self.gathered = gathered
-
-    def step(self, field, optimizer, t, resized):
-        parents = torch.tensor([2, *range(1, len(field))])
-        if t == 2 and self.gathered:
-            field.take(parents)
-            optimizer.take(parents, parents == 2)
-            resized(parents)
-        elif t == 2:
-            for p in field.raw().values():
-                p[0] = p[2]
-        field.means.data += 0.01
-        field.opacities.data -= 0.01
-        field.sh0.data[1] += 0.01  # as no other's
-        return False
-
-
 def brings(make):
     """A strategy with this densifier."""
     strategy = type("Brings", (Strategy,), {"densifier": lambda self, field, views, seed: make(len(field))})
@@ -402,18 +380,6 @@ def test_a_densifier_of_ones_own_gets_the_scores_that_it_collects():
         iterate(state, toy.RASTERIZER)
     assert len(state.field) == len(state.density.sums) == 2 * n
     assert bool(state.density.sums.any())
-
-
-def test_a_densifier_that_moves_gaussians_must_say_so():
-    state = brings(lambda n: Moves(n, gathered=True))
-    while state.t <= 3:
-        iterate(state, toy.RASTERIZER)
-    state = brings(lambda n: Moves(n, gathered=False))
-    iterate(state, toy.RASTERIZER)
-    with pytest.raises(
-        AnswerError, match=r"Moves.step\(\) must call resized.* row 0 is now a copy of row 2, so parents.0. is 2"
-    ):
-        iterate(state, toy.RASTERIZER)
 
 
 @pytest.mark.parametrize(

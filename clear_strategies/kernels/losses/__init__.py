@@ -12,12 +12,12 @@ import logging
 from functools import cache
 from importlib import import_module
 from types import ModuleType
-from typing import Final, Literal, get_args
+from typing import Literal, get_args
 
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.errors import SettingError
+from clear_strategies.core.checks import require_choice
 from clear_strategies.kernels import native
 from clear_strategies.kernels.losses import reference
 from clear_strategies.kernels.losses.images import supported
@@ -29,7 +29,6 @@ __all__ = ["Choice", "LossAndGradient", "haar_l1", "photometric", "require", "ss
 _log = logging.getLogger(__name__)
 
 Choice = Literal["auto", "torch", "cpp", "warp"]
-_CHOICES: Final = get_args(Choice)
 
 
 def require(kernels: Choice, device: str = "cpu") -> None:
@@ -39,8 +38,7 @@ def require(kernels: Choice, device: str = "cpu") -> None:
         SettingError: there is no such implementation.
         BackendUnavailable: "cpp" was not compiled, or Warp is not installed; the message says what to do.
     """
-    if kernels not in _CHOICES:
-        raise SettingError(f"kernels must be one of {', '.join(_CHOICES)}, got {kernels!r}.")
+    require_choice("kernels", kernels, get_args(Choice))
     if kernels == "cpp":
         native.module()
     if kernels == "warp":
