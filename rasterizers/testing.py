@@ -10,7 +10,6 @@
 from __future__ import annotations
 
 import functools
-import inspect
 import logging
 import math
 from collections.abc import Callable, Sequence
@@ -38,7 +37,7 @@ class ContractError(AssertionError):
 
 
 def check_rasterizer(make: Make, *, reference: bool = True) -> None:
-    """Run every check; those of depth if the rasterizer draws it.
+    """Run every check, with depth if the rasterizer draws it.
 
     Args:
         make: the class, or a function that builds the rasterizer from fields of `RasterSettings`.
@@ -53,8 +52,22 @@ def check_rasterizer(make: Make, *, reference: bool = True) -> None:
     remedy = "Derive it from rasterizers.backend.Backend, and implement traits and draw"
     require(not missing, f"a rasterizer has {', '.join(members)}, but this one has no {', '.join(missing)}. {remedy}")
     for check in CHECKS:
-        if reference or inspect.unwrap(check) is not inspect.unwrap(check_agrees_with_the_reference):
+        if reference or check is not check_agrees_with_the_reference:
             check(make)
+
+
+def _also_of_depth(check: Callable[..., None]) -> Check:
+    """The check of an image without depth, and with depth if the rasterizer draws it."""
+
+    @functools.wraps(check)
+    def both(make: Make) -> None:
+        check(make, depth=False)
+        if make().traits.depth:
+            check(make, depth=True)
+        else:
+            _log.info("%s: depth is not checked, the rasterizer's traits.depth is False.", check.__name__)
+
+    return both
 
 
 @torch.no_grad()
@@ -123,7 +136,8 @@ def check_sum_equals_sum_of_gradients(make: Make) -> None:
         _close(getattr(found, name), getattr(expected, name), 1e-5, f"the sum's {name}")
 
 
-def check_dropped_equals_absent(make: Make, *, depth: bool = False) -> None:
+@_also_of_depth
+def check_dropped_equals_absent(make: Make, *, depth: bool) -> None:
     """A Gaussian with opacity 0 is invisible and has no gradient, and the image is as without it."""
     rasterizer = make()
     dtype = _widest(rasterizer)
@@ -142,7 +156,8 @@ def check_dropped_equals_absent(make: Make, *, depth: bool = False) -> None:
         _close(rows[kept], gradient_of(expected, name)[0], 1e-5, f"the others' {name}")
 
 
-def check_nothing_to_draw(make: Make, *, depth: bool = False) -> None:
+@_also_of_depth
+def check_nothing_to_draw(make: Make, *, depth: bool) -> None:
     """With no Gaussian, or none in view: the background, alpha and depth 0, and zero gradients of the right shape."""
     background = (0.1, 0.6, 0.3)
     rasterizer = make(background=background)
@@ -161,7 +176,8 @@ def check_nothing_to_draw(make: Make, *, depth: bool = False) -> None:
             require(found.numel() == 0 or float(found.abs().max()) == 0, f"the gradient of {name} is not 0")
 
 
-def check_scales_together_equal_one_by_one(make: Make, *, depth: bool = False) -> None:
+@_also_of_depth
+def check_scales_together_equal_one_by_one(make: Make, *, depth: bool) -> None:
     """`render_scales` draws each job as if alone, with depth one of two."""
     rasterizer = make()
     splats, camera = scene(60, dtype=_widest(rasterizer)), _camera(48, 33)
@@ -187,7 +203,8 @@ def check_equal_depths_have_an_order(make: Make) -> None:
     require(bool((first == second).all()), "two renderings of one scene differ")
 
 
-def check_agrees_with_the_reference(make: Make, *, depth: bool = False) -> None:
+@_also_of_depth
+def check_agrees_with_the_reference(make: Make, *, depth: bool) -> None:
     """Image, alpha, projected centres and gradients agree with the reference in float64, at the default cut-offs, for SH degrees
     0 to 3.
     """
@@ -216,33 +233,15 @@ def check_agrees_with_the_reference(make: Make, *, depth: bool = False) -> None:
             _close(a, b, 1e-3, f"{bands} bands: gradient of {name}")
 
 
-def _of_depth(check: Callable[..., None]) -> Check:
-    """The same check of a rendering with depth, for rasterizers that draw it."""
-
-    @functools.wraps(check)
-    def of_depth(make: Make) -> None:
-        if make().traits.depth:
-            check(make, depth=True)
-        else:
-            _log.info("%s: not checked, the rasterizer's traits.depth is False.", of_depth.__name__)
-
-    of_depth.__name__ = f"{check.__name__}_of_depth"
-    return of_depth
-
-
-_WITH_OR_WITHOUT_DEPTH: Final = (
-    check_dropped_equals_absent,
-    check_nothing_to_draw,
-    check_scales_together_equal_one_by_one,
-    check_agrees_with_the_reference,
-)
 CHECKS: Final[Sequence[Check]] = (
     check_gradients_are_finite_differences,
     check_cotangents_together_equal_one_by_one,
     check_sum_equals_sum_of_gradients,
-    *_WITH_OR_WITHOUT_DEPTH,
+    check_dropped_equals_absent,
+    check_nothing_to_draw,
+    check_scales_together_equal_one_by_one,
+    check_agrees_with_the_reference,
     check_equal_depths_have_an_order,
-    *(_of_depth(check) for check in _WITH_OR_WITHOUT_DEPTH),
 )
 
 

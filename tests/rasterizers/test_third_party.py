@@ -96,7 +96,7 @@ def test_third_parties_rasterizers_pass_the_checks_and_are_refused_where_depth_i
         check_rasterizer(Flat)
     with pytest.raises(RuntimeError, match="does not require grad"):
         check_rasterizer(NeedsAutograd)
-    assert "check_nothing_to_draw_of_depth: not checked, the rasterizer's traits.depth is False" in caplog.text
+    assert "check_nothing_to_draw: depth is not checked, the rasterizer's traits.depth is False" in caplog.text
     splats, camera = scene(5), Camera(torch.eye(4), 40.0, 40.0, 20.0, 15.0, 40, 30)
     assert autograd.draw(Flat(), splats, camera).depth is None
     with pytest.raises(ValueError, match=r"Flat draws no depth \(its traits\.depth is False\)"):
