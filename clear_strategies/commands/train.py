@@ -74,10 +74,15 @@ def overrides(arguments: Sequence[str]) -> list[str]:
             f"train: {others[0]} is a second folder. Put all photos of the scene into one folder, and give that."
         )
     from clear_strategies.compose import quoted
+    from clear_strategies.jobs.resume import begun
 
+    kind = detect(path)
+    if kind == "photos" and begun(path):
+        remedy = f"view {shlex.quote(str(path))} shows it; the command that began it, with fit.resume={path}, goes on"
+        raise SettingError(f"train: {path} is the folder of a run, not of photos. clear-strategies {remedy}.")
     defaults = {"+strategy=best": CHOOSE_STRATEGIES, f"fit.iterations={_ITERATIONS}": _CHOOSE_ITERATIONS}
     used = [default for default, chosen in defaults.items() if not any(word.startswith(chosen) for word in rest)]
-    return [*used, f"data={detect(path)}", f"data.path={quoted(str(path))}", *rest]
+    return [*used, f"data={kind}", f"data.path={quoted(str(path))}", *rest]
 
 
 def detect(path: Path) -> str:

@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 _FOLDERS: Final = ("images", "images_2", "images_4", "images_8")
 _BELOW: Final = ("*/*", "*/*/*")  # a memory card has DCIM/100CANON
 _NO_PHOTOS: Final = ("mask", "masks")  # names of folders
-FRAMES: Final = "ffmpeg -i VIDEO -vf thumbnail=15 -fps_mode passthrough -q:v 2 FOLDER/%03d.jpg"
+FRAMES: Final = "ffmpeg -i FILE -vf thumbnail=15 -fps_mode passthrough -q:v 2 FOLDER/%03d.jpg"
 HDR: Final = "-vf thumbnail=15,scale=out_primaries=bt709:out_transfer=iec61966-2-1,format=rgb24 (ffmpeg 8)"
 # Kinds of files that folders contain in place of photos: their suffixes, and how to convert them.
 _OTHER_KINDS: Final = {

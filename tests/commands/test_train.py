@@ -92,7 +92,9 @@ def test_a_tilde_that_no_shell_expanded_is_the_users_folder(tmp_path, monkeypatc
     assert Run(Path("~/done")).folder == tmp_path / "done"
 
 
-def test_an_address_is_told_to_be_downloaded():
+def test_an_address_is_told_to_be_downloaded_and_a_run_to_be_viewed(tmp_path):
+    with pytest.raises(SettingError, match=r"run is the folder of a run, .*strategies view .*run shows it; .* fit\.resume="):
+        train.overrides([str(make_run(tmp_path / "run"))])
     with pytest.raises(SettingError, match=r"https://a\.b/c\.zip is an address\. Download what is there"):
         train.overrides(["https://a.b/c.zip"])
 

@@ -290,7 +290,7 @@ def test_the_line_for_clips_in_hdr_gives_photos_in_srgb(tmp_path: Path, transfer
     source = ["-f", "lavfi", "-i", "color=c=0xC83C28:s=64x64:d=1:r=30", "-vf", made, "-c:v", "ffv1", str(clip)]
     if subprocess.run([ffmpeg, "-v", "error", *source], check=False).returncode:
         pytest.skip("this ffmpeg cannot make the clip")
-    line = FRAMES.replace("VIDEO", str(clip)).replace("FOLDER", str(tmp_path)).split()
+    line = FRAMES.replace("FILE", str(clip)).replace("FOLDER", str(tmp_path)).split()
     line[line.index("-vf") + 1] = HDR.split()[1]
     subprocess.run([ffmpeg, "-v", "error", *line[1:]], check=True)
     photos = sorted(tmp_path.glob("*.jpg"))

@@ -363,7 +363,7 @@ REFUSED: dict[str, tuple[Callable[[Path], object], tuple[str, ...], dict[str, ob
     "an archive": (
         lambda f: only(f, "my photos.zip"), ("unpack them, and give the folder: unzip 'my photos.zip' -d FOLDER",), None
     ),
-    "a video": (lambda f: only(f, "clip.MOV"), ("ffmpeg -i VIDEO -vf thumbnail=15",), None),
+    "a video": (lambda f: only(f, "clip.MOV"), ("ffmpeg -i clip.MOV -vf thumbnail=15",), None),
     "another format": (
         lambda f: only(f, "a.avif", "b.avif", "c.bmp"), ("save them as PNG or JPEG: mogrify -format png a.avif",), None
     ),
