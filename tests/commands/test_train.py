@@ -35,7 +35,15 @@ def test_a_folder_of_any_name_becomes_data_path_quoted_only_where_hydra_would_re
     config = composed(overrides, "config")
     assert tree(config)["data"]["path"] == name
     assert config.fit.iterations == 7
-    assert set(config.strategies) == {"gco", "p2g", "svs", "pseudo_views", "fading_opacity", "mcmc", "random_background"}
+    assert set(config.strategies) == {
+        "gco",
+        "p2g",
+        "svs",
+        "pseudo_views",
+        "fading_opacity",
+        "mcmc",
+        "random_background",
+    }
 
 
 @pytest.mark.parametrize("flag", ["--config-dir", "-cd"])
@@ -52,7 +60,9 @@ def test_a_path_with_spaces_that_is_not_quoted_is_told(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "Meine Fotos").mkdir()
     for _ in range(2):
-        with pytest.raises(SettingError, match=r"train: Meine Fotos has spaces.*: clear-strategies train 'Meine Fotos'\."):
+        with pytest.raises(
+            SettingError, match=r"train: Meine Fotos has spaces.*: clear-strategies train 'Meine Fotos'\."
+        ):
             train.overrides(["Meine", "Fotos", "fit.seed=1"])
         (tmp_path / "Meine").mkdir(exist_ok=True)  # a folder of the first word is there, too
 
@@ -76,7 +86,9 @@ def test_a_tilde_that_no_shell_expanded_is_the_users_folder(tmp_path, monkeypatc
 
 
 def test_an_address_is_told_to_be_downloaded_and_a_run_to_be_viewed(tmp_path):
-    with pytest.raises(SettingError, match=r"run is the folder of a run, .*strategies view .*run shows it; .* fit\.resume="):
+    with pytest.raises(
+        SettingError, match=r"run is the folder of a run, .*strategies view .*run shows it; .* fit\.resume="
+    ):
         train.overrides([str(make_run(tmp_path / "run"))])
     with pytest.raises(SettingError, match=r"https://a\.b/c\.zip is an address\. Download what is there"):
         train.overrides(["https://a.b/c.zip"])

@@ -48,10 +48,10 @@ def test_auto_triangulates_where_it_can_then_takes_stereo_then_random_points(cap
 
 
 @pytest.mark.parametrize(
-    ("compare", "hr_is_photo", "size"), [("auto", True, (96, 128)), ("hr", False, (48, 64)), ("lr", True, (48, 64))]
+    ("compare", "hr_is_photo", "size"), [("auto", True, (72, 96)), ("hr", False, (36, 48)), ("lr", True, (36, 48))]
 )
 def test_stereo_at_hr_keeps_its_size_for_photos_and_that_of_lr_for_sr_images(compare, hr_is_photo, size) -> None:
-    hr = plane_photos(3, 128, 96)
+    hr = plane_photos(3, 96, 72)
     lr = [photo.reduced(2) for photo in hr]
     settings = CloudSettings(init="stereo", compare=compare, stereo=StereoSettings(max_planes=64))
     found = initial_points(settings, lr, hr=hr, hr_is_photo=hr_is_photo)
@@ -168,8 +168,8 @@ def test_points_fill_the_given_box_with_near_grey_and_the_same_seed_gives_the_sa
     one, other = (random_cloud([photo()], 10_000, seed, 1.3).means for seed in (0, 1))
     assert torch.equal(one, cloud.means)
     assert not torch.equal(other, cloud.means)
-    settings = CloudSettings(init="triangulated", max_points=300)
-    one, two = (initial_points(settings, plane_photos(2), seed=3).cloud for _ in range(2))
+    settings = CloudSettings(init="random", random_points=1_000, max_points=300)
+    one, two = (initial_points(settings, [photo()], seed=3).cloud for _ in range(2))
     assert len(one) == 300
     assert torch.equal(one.means, two.means)
     assert torch.equal(one.colors, two.colors)

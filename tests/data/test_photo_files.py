@@ -155,7 +155,8 @@ def test_images_are_listed_by_name_and_ending_and_the_first_of_the_usual_folders
 # ---- photos with a colour profile of their own become sRGB; photos of sRGB keep their bits
 LEVELS = np.random.default_rng(0).integers(30, 200, (8, 8, 3), np.uint8)
 SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-SWAPPED = SRGB.replace(b"rXYZ", b"....").replace(b"gXYZ", b"rXYZ").replace(b"....", b"gXYZ")  # red is green, and green red
+# Red is green, and green is red.
+SWAPPED = SRGB.replace(b"rXYZ", b"....").replace(b"gXYZ", b"rXYZ").replace(b"....", b"gXYZ")
 # With the exponent 2.36 in place of 2.4: two levels apart at most.
 OF_A_MAKER = SRGB.replace(struct.pack(">I", round(2.4 * 65536)), struct.pack(">I", round(2.36 * 65536)))
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from clear_strategies.data.ply import GaussianPly, read_gaussians, read_points, write_gaussians, write_points
 from clear_strategies.errors import DataError
 
-_ROUNDTRIP = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+_ROUNDTRIP = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 _NUMBERS = st.floats(width=32, allow_nan=False, allow_infinity=False)
 
 

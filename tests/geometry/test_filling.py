@@ -5,8 +5,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from clear_strategies.core.points import PointCloud
 from clear_strategies.geometry.cleaning import averaged_in_voxels, without_outliers
@@ -17,8 +15,7 @@ from rasterizers.interface import BackendUnavailable
 from tests.helpers.planes import cloud_of, depth_of, photo
 
 
-@given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.sampled_from((1, 2, 4)))
-@settings(max_examples=20, deadline=None)
+@pytest.mark.parametrize(("a", "b", "stride"), [(-0.5, 0.5, 1), (0.3, 0.0, 2), (0.5, 0.5, 4)])
 def test_new_points_lie_on_the_plane_of_the_old_ones(a: float, b: float, stride: int) -> None:
     """Inverse depth is linear in pixels on the plane z = 5 + a x + b y."""
     view = photo()

@@ -97,12 +97,12 @@ def write_photos(folder: Path, size: tuple[int, int] = (WIDTH, HEIGHT), mode: st
         Image.fromarray(pixels).save(folder / name)
 
 
-def turn(path: Path, orientation: int, *, rotate: bool = True) -> np.ndarray:
+def turn(path: Path, *, rotate: bool = True) -> np.ndarray:
     """Store a photo turned, as its EXIF block then says; its upright pixels. Without `rotate` the block alone changes."""
     with Image.open(path) as image:
         upright = image.convert("RGB")
-    stored = {3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}[orientation]
-    (upright.transpose(stored) if rotate else upright).save(path, exif=exif_orientation(orientation))
+    stored = Image.Transpose.ROTATE_90  # for EXIF's 6
+    (upright.transpose(stored) if rotate else upright).save(path, exif=exif_orientation(6))
     return np.array(upright)
 
 

@@ -91,26 +91,20 @@ def test_the_network_behind_a_prior_is_found_and_named_by_its_weights(fake: Path
 
 
 @real
-def test_waifu2x_is_nearer_to_the_truth_than_bicubic_and_realesrgan_is_another(caplog):
-    truth = demo.read(width=192, height=128, views=3, train=2).frames[0].load().image
+def test_waifu2x_is_nearer_to_the_truth_than_bicubic_and_realesrgan_is_another_whatever_the_threads():
+    truth = demo.read(width=96, height=64, views=3, train=2).frames[0].load().image
     lr = images.downsample(truth, 4)
     assert psnr(Ncnn()("view", lr, 4), truth) > psnr(Bicubic()("view", lr, 4), truth) + 0.5
     half = images.downsample(truth, 2)
     assert psnr(Ncnn()("view", half, 2), truth) > psnr(Bicubic()("view", half, 2), truth) + 0.5
     sr = Ncnn("realesrgan")("view", lr, 4)
     assert psnr(images.downsample(sr, 4, "area"), lr) > 25
+    assert torch.equal(sr, images.quantize(sr))
     assert not torch.equal(sr, Ncnn()("view", lr, 4))
-
-
-@pytest.mark.slow
-@real
-def test_the_real_networks_repeat_with_any_number_of_threads() -> None:
-    lr = photo(20, 31)
-    for model in ("waifu2x", "realesrgan"):
-        first = Ncnn(model)("view", lr, 4)
-        assert torch.equal(first, images.quantize(first))
-        torch.set_num_threads(2)
-        try:
-            assert torch.equal(Ncnn(model)("view", lr, 4), first)
-        finally:
-            torch.set_num_threads(1)
+    part = lr[:4, :6]
+    one = [Ncnn(model)("view", part, 4) for model in ("waifu2x", "realesrgan")]
+    torch.set_num_threads(2)
+    try:
+        assert all(map(torch.equal, one, (Ncnn(model)("view", part, 4) for model in ("waifu2x", "realesrgan"))))
+    finally:
+        torch.set_num_threads(1)

@@ -5,8 +5,6 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import Tensor
 
 from clear_strategies.core import images
@@ -51,18 +49,14 @@ def test_photos_fill_the_picture_and_cameras_look_at_the_room_upright_from_diffe
     assert float((centers[0] - centers[-1]).norm()) == pytest.approx(1.5)
 
 
-@given(train=st.integers(2, 7), more=st.integers(1, 9))
-@settings(max_examples=40, deadline=None)
-def test_as_many_views_train_as_were_asked_for(train: int, more: int) -> None:
-    frames = demo.read(width=8, height=8, views=train + more, train=train).frames
-    assert sum(frame.split == "train" for frame in frames) == train
-    assert len({frame.name for frame in frames}) == train + more
-
-
-@pytest.mark.parametrize(("views", "train"), [(3, 3), (12, 1), (2, 4)])
-def test_impossible_splits_are_refused(views: int, train: int) -> None:
-    with pytest.raises(SettingError, match=r"data\.reader\.train: 2 <= train < views must hold"):
-        demo.read(views=views, train=train)
+def test_as_many_views_train_as_were_asked_for_and_impossible_splits_are_refused() -> None:
+    for views, train in ((3, 2), (16, 7), (8, 7), (11, 2)):
+        frames = demo.read(width=8, height=8, views=views, train=train).frames
+        assert sum(frame.split == "train" for frame in frames) == train
+        assert len({frame.name for frame in frames}) == views
+    for views, train in ((3, 3), (12, 1), (2, 4)):
+        with pytest.raises(SettingError, match=r"data\.reader\.train: 2 <= train < views must hold"):
+            demo.read(views=views, train=train)
 
 
 def test_neighbouring_views_agree_where_depth_says_they_see_the_same_place() -> None:
@@ -90,7 +84,7 @@ def test_neighbouring_views_agree_where_depth_says_they_see_the_same_place() -> 
 
 def test_photos_are_free_of_aliasing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Near the limit of many rays without prefiltering; one ray a pixel, which does alias, is five times further away."""
-    camera = demo.read(width=96, height=72).frames[5].camera
+    camera = demo.read(width=64, height=48).frames[5].camera
     photo = demo.render(camera)
     sample = Texture.sample
     monkeypatch.setattr(Texture, "sample", lambda self, at, footprint: sample(self, at, np.ones_like(footprint)))
