@@ -9,7 +9,6 @@ import json
 import re
 import runpy
 import signal
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -323,13 +322,3 @@ def test_the_readmes_picture_is_drawn_from_a_run_of_the_demo(first_run, tmp_path
     with Image.open(tmp_path / "demo.png") as picture, Image.open(DOCS / "images" / "demo.png") as shown:
         assert picture.width > picture.height
         assert shown.format == "PNG"
-
-
-@pytest.mark.slow
-def test_the_site_builds_without_a_warning(tmp_path):
-    pytest.importorskip("mkdocs")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stdout + result.stderr
-    page = (tmp_path / "site" / "reference" / "strategies.html").read_text()
-    assert "regularize" in page
