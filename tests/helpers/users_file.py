@@ -1,4 +1,4 @@
-"""What a user writes: a strategy, a loop with `attach`, a training. `tests/test_package.py` has mypy --strict check it."""
+"""What a user writes: a strategy, a loop with `attach`, a training. `mypy` checks it with the packages."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
