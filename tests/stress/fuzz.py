@@ -163,10 +163,13 @@ def _require_capture(capture: Capture) -> None:
 def measure(targets: Targets, count: int) -> Row:
     """How many of the first `count` mutants of each format gave an unsound result, another error, or took too much.
 
-    Each format is read in a process of its own, without the checks of types that tests run with.
+    Each format is read in a process of its own, without the checks of types that tests run with. All are forked off one that has
+    imported this module.
     """
+    processes = multiprocessing.get_context("forkserver")
+    processes.set_forkserver_preload([__name__])
     names, failed, first = list(_written(targets)[1]), 0, "none"
-    with ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(os.cpu_count(), mp_context=processes) as pool:
         for name, (n, where) in zip(names, pool.map(damaged, repeat(targets), names, repeat(count)), strict=True):
             failed, first = failed + n, f"{name}: {where}" if n and not failed else first
     what = f"damaged files, {targets.__name__}: unsound, untyped or slow"
