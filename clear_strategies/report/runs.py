@@ -48,6 +48,8 @@ class FinishedRun:
         numbers: mean scores of the test views, or of the training views if there are no test views, those of the run's own
             metrics as "metrics.<name>"; "bicubic", "prior": PSNR of these images; conflict, gaussians, seconds. NaN: unknown.
         views: the names of the scored views. config: every setting, by its dotted key.
+        job: its number in a sweep, None without one; ended: when, UTC, empty if unknown; keys: of all overrides that may change a
+            result, which the jobs of a sweep share.
     """
 
     folder: Path
@@ -60,6 +62,9 @@ class FinishedRun:
     numbers: Mapping[str, float]
     views: tuple[str, ...]
     config: Mapping[str, Any]
+    job: int | None
+    ended: str
+    keys: frozenset[str]
 
     @property
     def data(self) -> str:
@@ -79,13 +84,16 @@ class FinishedRun:
         psnr = {image: scores.psnr for image, scores in part.mean.items()}
         ours = msgspec.structs.asdict(part.mean["ours"])
         own = {f"{OWN}{name}": x for name, x in ours.pop("own").items()}
+        given, hydra = {key_of(word): word for word in overrides}, _hydra(folder)
+        chosen = dict(re.findall(r"^      (protocol|scene): (\w+)$", hydra, re.MULTILINE))
+        job = re.search(r"^    num: (\d+)$", hydra, re.MULTILINE)
         return cls(
             folder=folder,
             scene=content.scene + (f" ({', '.join(marks)})" if marks else ""),
             marks=", ".join(marks),
             name=Chosen(content.method, content.strategies, overrides).title,
-            protocol=_protocol(folder),
-            settings=tuple(filter(_is_setting, {key_of(word): word for word in overrides}.values())),
+            protocol=chosen.get("scene") or chosen.get("protocol"),
+            settings=tuple(filter(_is_setting, given.values())),
             seed=content.seed,
             numbers={
                 **ours,
@@ -97,6 +105,9 @@ class FinishedRun:
             },
             views=tuple(sorted(part.views)),
             config=content.config,
+            job=int(job[1]) if job else None,
+            ended=str(content.provenance.get("date", "")),
+            keys=frozenset(given) - CHANGES_NO_RESULT,
         )
 
 
@@ -106,22 +117,21 @@ def collect(folders: Iterable[Path]) -> list[FinishedRun]:
     """
     folders = list(folders)
     folders += [link for folder in folders for link in sorted(folder.glob("*")) if link.is_symlink() and link.is_dir()]
-    finished: dict[Path, None] = {}
+    seen, runs = set[Path](), list[FinishedRun]()
     for folder in folders:
-        in_folder = sorted(path.parent for path in folder.rglob(FINISHED))
-        sweeps = [run.parent for run in in_folder]
-        places = _places(in_folder)
-        in_order = sorted(in_folder, key=lambda run: (sweeps.index(run.parent), places[run], in_folder.index(run)))
-        finished |= dict.fromkeys(run.resolve() for run in in_order)
+        in_folder = list[FinishedRun]()
+        for path in sorted(folder.rglob(FINISHED)):
+            if (run := path.parent.resolve()) in seen:
+                continue
+            seen.add(run)
+            try:
+                in_folder.append(FinishedRun.read(run))
+            except DataError as error:
+                _log.warning("%s; left out.", error)
+        runs += _in_order(in_folder)
     for unfinished in sorted({path.parent for folder in folders for path in folder.rglob(_HYDRA)}):
-        if unfinished.resolve() not in finished:
+        if unfinished.resolve() not in seen:
             _log.warning("%s: left out, it has no metrics.json: the run did not finish.", unfinished)
-    runs = []
-    for folder in finished:
-        try:
-            runs.append(FinishedRun.read(folder))
-        except DataError as error:
-            _log.warning("%s; left out.", error)
     if not runs:
         names = ", ".join(map(str, folders))
         raise DataError(names, "runs", "there is no finished run here", "give the folder of a run or of a sweep")
@@ -192,32 +202,20 @@ def _is_setting(override: str) -> bool:
     return not (named_elsewhere or key.startswith(("hydra", OWN)) or key in CHANGES_NO_RESULT)
 
 
-def _places(folders: Sequence[Path]) -> dict[Path, tuple[int, int]]:
-    """The sweep of each run among those that have its `hydra.sweep.dir`, by the dates of their ends, and its number there; of two
-    runs with one number, the later one begins another sweep. 0, 0 for a single run.
+def _in_order(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
+    """Folder by folder, in each the runs without a sweep, then its sweeps by the end of their first jobs, their jobs by number. The
+    jobs of a sweep have the same keys; of two with the same number, the later one begins another sweep.
     """
-    jobs = {run: int(said[1]) for run in folders if (said := re.search(r"^    num: (\d+)$", _hydra(run), re.MULTILINE))}
-    places, begun = dict.fromkeys(folders, (0, 0)), dict[Path, list[set[int]]]()
-    for run in sorted(jobs, key=lambda run: (_date(run), jobs[run])):
-        of_folder = begun.setdefault(run.parent, [set()])
-        if jobs[run] in of_folder[-1]:
-            of_folder.append(set())
-        of_folder[-1].add(jobs[run])
-        places[run] = len(of_folder), jobs[run]
-    return places
-
-
-def _date(folder: Path) -> str:
-    """When a run finished, UTC; empty if its file cannot be read, which `FinishedRun.read` tells."""
-    try:
-        return str(metrics.read(folder / FINISHED, "").provenance.get("date", ""))
-    except DataError:
-        return ""
-
-
-def _protocol(folder: Path) -> str | None:
-    chosen = dict(re.findall(r"^      (protocol|scene): (\w+)$", _hydra(folder), re.MULTILINE))
-    return chosen.get("scene") or chosen.get("protocol")
+    sweeps, latest = list[dict[int, FinishedRun]](), dict[Any, dict[int, FinishedRun]]()
+    for run in sorted(runs, key=lambda run: ("", 0) if run.job is None else (run.ended, run.job)):
+        sweep, job = (run.folder, 0) if run.job is None else ((run.folder.parent, run.keys), run.job)
+        if job in latest.get(sweep, {job: run}):
+            latest[sweep] = {}
+            sweeps.append(latest[sweep])
+        latest[sweep][job] = run
+    parents = [run.folder.parent for run in runs]
+    in_sweeps = [sweep[job] for sweep in sweeps for job in sorted(sweep)]
+    return sorted(in_sweeps, key=lambda run: parents.index(run.folder.parent))
 
 
 def _hydra(folder: Path) -> str:

@@ -471,14 +471,15 @@ def test_runs_of_a_sweep_are_in_the_order_of_their_jobs_and_linked_ones_count_on
     assert [run.name for run in report.collect([runs, ours, runs / ".." / "runs" / "ours"])] == ["gco", "clear"]
 
 
-def test_two_sweeps_in_one_folder_stand_one_after_the_other(tmp_path: Path) -> None:
+def test_sweeps_in_one_folder_stand_one_after_the_other_also_one_that_was_resumed(tmp_path: Path) -> None:
     """Jobs that run at once end in any order, and names of folders say nothing of time."""
-    ended = [("m_one", 1), ("z_none", 0), ("b_two", 0), ("n_three", 1), ("a_last", 2)]
+    ended = [("m_one", 1), ("z_none", 0), ("b_two", 0), ("n_three", 1), ("a_last", 2), ("o_ther", 0), ("l_resumed", 3)]
     for minute, (name, number) in enumerate(ended):
-        provenance = {"date": f"2026-11-22T10:{minute:02}:00+00:00"}
-        folder = make_run(tmp_path / name, f"+strategy={name[2:]}", provenance=provenance)
+        provenance, more = {"date": f"2026-11-22T10:{minute:02}:00+00:00"}, ["fit.iterations=9"] * (name == "o_ther")
+        folder = make_run(tmp_path / name, f"+strategy={name[2:]}", *more, provenance=provenance)
         files.write_text(folder / ".hydra" / "hydra.yaml", f"hydra:\n  job:\n    num: {number}\n")
-    assert [run.name for run in report.collect([tmp_path])] == ["none", "one", "two", "three", "last"]
+    in_order = ["none", "one", "two", "three", "last", "resumed", "ther"]
+    assert [run.name for run in report.collect([tmp_path])] == in_order
 
 
 def test_scenes_of_one_name_with_other_photos_or_other_views_are_no_one_scene(tmp_path, caplog):
