@@ -70,7 +70,6 @@ def prepare(
             progress(len(made))
     train, test = tuple(made[: len(train_frames)]), tuple(made[len(train_frames) :])
     require_shown(train)
-    _warn_if_equal(train)
     with work_log.stage("initial points"):
         initial = initial_points(
             cloud, [v.lr for v in train], hr=[v.hr for v in train], hr_is_photo=views.photos_are == "both",
@@ -241,13 +240,3 @@ def _check_positions(capture: Capture, cameras: Sequence[Camera], cloud: CloudSe
             "stereo and training lose detail. Subtract the same point from all camera centres and points of the capture.",
             apart, away, rounded,
         )  # fmt: skip
-
-
-def _warn_if_equal(train: Sequence[View]) -> None:
-    """Warn if all photos are equal, as copies or photos of a lens cap: their poses may be right, but depth cannot be found."""
-    first, *others = (view.lr.image for view in train)
-    if others and all(torch.equal(first, image) for image in others):
-        _log.warning(
-            "the %d photos are all equal: there is nothing to see depth by. Give the photos that were taken.",
-            len(train),
-        )

@@ -16,8 +16,8 @@ from clear_strategies.data.view_settings import ViewSettings, lr_size, split, wi
 from clear_strategies.errors import DataError, SettingError
 from rasterizers import Camera
 from tests.helpers.captures import POINTS_AT_RANDOM as POINTS
-from tests.helpers.captures import alike, in_a_row, papers
 from tests.helpers.captures import alike as capture
+from tests.helpers.captures import in_a_row, papers
 
 # ---- splits and sizes: the papers' view indices and pixel counts; what is refused before a photo is decoded
 # Training indices among the n photos of some LLFF scenes, and the number of test views: the 3-view protocol of RegNeRF, FSGS,
@@ -194,12 +194,6 @@ def test_lr_images_of_photos_that_differ_in_their_endings_are_found_again(tmp_pa
     save_lr(twins, papers(train=2, test_every=0), tmp_path)
     read = prepare(twins, papers(train=2, test_every=0, lr_folder=str(tmp_path)), Bicubic(), POINTS)
     assert [float(view.lr.image.mean()) for view in read.train] == [0, 1]
-
-
-@pytest.mark.parametrize(("photos", "warned"), [(alike(3), True), (in_a_row((16, 16), (24, 16)), False)])
-def test_photos_that_are_all_equal_are_told_though_their_poses_are_known(photos, warned, caplog):
-    prepare(photos, papers(train=2, test_every=0), Bicubic(), POINTS)
-    assert ("photos are all equal: there is nothing to see depth by" in caplog.text) == warned
 
 
 @pytest.mark.parametrize("init", ["sfm", "sfm_train", "ply"])

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
 
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import BLACK, Capture, Frame, lens_notes, sorted_by_name
@@ -16,8 +14,6 @@ from clear_strategies.data.photo_folders import folder_note, image_folder, image
 from clear_strategies.data.readers.colmap_model import Model, find_model, is_model, model_folders, read_model
 from clear_strategies.errors import counted
 from rasterizers.interface import Color
-
-_UNEVEN: Final = 1e-6  # a quaternion's length may differ from 1 by this much without a note
 
 
 def recognises(path: Path) -> int:
@@ -101,8 +97,6 @@ def capture(
     if unposed:
         notes["without pose"] = f"{counted(len(unposed), 'photo')}, not used: {', '.join(unposed[:8])}"
     notes |= lens_notes(frames)
-    if uneven := sum(abs(math.hypot(*image.quat) - 1) > _UNEVEN for image in model.images):
-        notes["rotations"] = f"{uneven} quaternions were not of length 1 and were normalised"
     sfm = None
     if count := len(model.points.means):
         source = f"COLMAP {points or label}, {count:,} points, triangulated from all {len(model.images)} images"
