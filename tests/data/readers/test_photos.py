@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import ExifTags, Image, ImageFilter
+from scipy.spatial.transform import Rotation
 
 from clear_strategies import files
 from clear_strategies.core.images import to_bytes
@@ -46,16 +47,16 @@ def test_poses_are_those_of_the_ground_truth(shared_data, tmp_path, monkeypatch,
     assert capture.unplaced == {"z_flat.png": "0 features: blurred, dark, or without texture"}
     assert len(capture.points.means) > 100
 
-    found, real = (
-        torch.stack([f.camera.world_to_camera[:3, :3] for f in frames]) for frames in (capture.frames, truth)
-    )
-    relative = (found[1:] @ found[:1].mT) @ (real[1:] @ real[:1].mT).mT  # to the first camera
-    cosine = (relative.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
-    assert torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).max() < 1
-    p, q = (np.stack([f.camera.center.numpy() for f in frames]) for frames in (capture.frames, truth))
+    (R, p), (S, q) = (
+        (Rotation.from_matrix([f.camera.world_to_camera[:3, :3].numpy() for f in frames]),
+         np.stack([f.camera.center.numpy() for f in frames]))
+        for frames in (capture.frames, truth)
+    )  # fmt: skip
+    relative = (R[1:] * R[0].inv()) * (S[1:] * S[0].inv()).inv()  # to the first camera
+    assert np.degrees(relative.magnitude()).max() < 1
     p, q = p - p.mean(0), q - q.mean(0)
-    u, s, vt = np.linalg.svd(q.T @ p)
-    aligned = p @ (u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt).T * s.sum() / (p**2).sum()
+    turned = Rotation.align_vectors(q, p)[0].apply(p)
+    aligned = turned * (turned * q).sum() / (p**2).sum()
     assert np.linalg.norm(aligned - q, axis=1).max() < 0.02 * np.linalg.norm(q, axis=1).max()
 
     # A second reading takes the cached poses: without pycolmap it cannot estimate. Nothing is written among the photos.

@@ -124,10 +124,12 @@ def test_where_photos_have_an_ending_that_is_not_read_the_message_names_it(tmp_p
     root = tiny.nerfstudio(tmp_path)
     for name in NAMES:
         (root / "images" / name).rename((root / "images" / name).with_suffix(".CR2"))
-    with pytest.raises(
-        DataError, match=r"none of 3 is in .*images, such as a\.png; it holds 3 \.CR2: .* as PNG or JPEG"
-    ):
-        nerfstudio.read(root)
+    for skip_faulty in (False, True):
+        told = (
+            r"transforms\.json: photos: none of 3 is in .*images, such as a\.png; it holds 3 \.CR2: .* as PNG or JPEG"
+        )
+        with pytest.raises(DataError, match=told):
+            nerfstudio.read(root, skip_faulty=skip_faulty)
 
 
 # ---- poses that no reader reads beside photos

@@ -53,14 +53,6 @@ def test_a_defect_is_refused_in_one_line_with_the_setting_that_goes_on(tmp_path,
     assert "data.reader.skip_faulty" not in caplog.text  # it is set
 
 
-def test_a_capture_without_any_photo_is_refused_even_where_faulty_ones_are_skipped(tmp_path):
-    root, folder, read = built(tmp_path, "nerfstudio")
-    for name in NAMES:
-        (folder / name).unlink()
-    with pytest.raises(DataError, match=r"transforms\.json: photos: none of 3 is in .*/images, such as a\.png"):
-        read(root, skip_faulty=True)
-
-
 @pytest.mark.parametrize("rotate", [True, False])
 def test_a_photo_on_its_side_is_turned_where_the_camera_is_not_that_of_the_stored_pixels(tmp_path, rotate):
     root, folder, read = built(tmp_path, "colmap")
@@ -399,21 +391,6 @@ def test_photos_in_the_only_folder_that_holds_enough_are_used_with_a_line(place,
     capture = photos.read(root, folder.parent / "cache")
     assert (capture.name, [frame.name for frame in capture.frames]) == ("scene", ALL)
     assert told in caplog.text if told else not caplog.text
-
-
-# A file in place of a folder, and what the message says; tests/mistakes.csv has more.
-FILES = {
-    "photos.tar.gz": "or tar -xf photos.tar.gz", "a.PNG": "give the folder of all photos: clear-strategies train ",
-    "a.nef": "develop them", "cameras.txt": "give the folder of the photos or of the capture",
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_a_file_in_place_of_a_folder_is_told_by_its_kind(name: str, tmp_path: Path) -> None:
-    (tmp_path / name).touch()
-    assert detect(tmp_path / name) == "photos"
-    with pytest.raises(DataError, match=rf"{name}: photos: is a file: .*{FILES[name]}"):
-        photos.read(tmp_path / name)
 
 
 def test_photos_turned_by_exif_are_upright(of_photos):
