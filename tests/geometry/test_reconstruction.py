@@ -115,18 +115,6 @@ def test_hidden_pixels_give_no_points_and_their_colours_do_not_matter(plane: Ste
         reconstruct(photos, masks=[torch.zeros(48, 64)] * 3)
 
 
-def test_no_filled_point_is_hidden_in_the_only_photo_that_sees_it() -> None:
-    photos = plane_photos(2, 64, 48)
-    masks = [torch.ones(48, 64, dtype=torch.bool) for _ in photos]
-    for mask in masks:
-        mask[30:] = False
-    result = reconstruct(photos, masks=masks)
-    rows = result.means[:, 1] / result.means[:, 2] * photos[0].camera.fy + photos[0].camera.cy
-    assert "filled by" in result.summary
-    assert float(rows.max()) <= 30
-    assert float(reconstruct(photos).means[:, 1].max()) > float(result.means[:, 1].max())
-
-
 def test_without_opencv_and_kornia_the_cameras_give_the_range(monkeypatch, caplog):
     without(monkeypatch, "cv2", "kornia")
     result = reconstruct(plane_photos(3, 64, 48))

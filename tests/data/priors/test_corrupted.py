@@ -15,6 +15,7 @@ from clear_strategies.data.readers import demo
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.settings import build
 from tests.helpers.configs import composed
+from tests.helpers.image_files import noise
 
 
 class Sharp:
@@ -27,17 +28,10 @@ class Sharp:
         return images.quantize(large + 0.5 * (large - images.upsample(images.downsample(large, 8, "area"), 8)))
 
 
-def random_lr(seed: int = 0) -> Tensor:
-    """LR with structure at every scale."""
-    rng = np.random.default_rng(seed)
-    return torch.from_numpy(rng.random((24, 32, 3), dtype=np.float32))
-
-
 def test_errors_differ_between_views_and_seeds_and_without_share_or_strength_there_are_none():
-    lr = random_lr()
+    lr = noise(0, 24, 32)
     for none in ({"share": 0.0}, {"strength": 0.0}):
         assert torch.equal(Corrupted(Sharp(), **none)("a", lr, 4), Sharp()("a", lr, 4))
-    lr = random_lr()
     one, again, other = (Corrupted(Sharp(), patch=16, seed=seed)("a", lr, 4) for seed in (0, 0, 1))
     assert torch.equal(one, again)
     assert not torch.equal(one, other)
@@ -116,7 +110,7 @@ def test_a_truth_of_another_size_is_refused_in_one_line() -> None:
 
 
 def test_hidden_errors_shrink_to_the_same_lr_pixels_and_are_still_wrong():
-    lr = random_lr()
+    lr = noise(0, 24, 32)
     right = Sharp()("a", lr, 4)
     seen, hidden = (Corrupted(Sharp(), patch=32, hidden=h)("a", lr, 4) for h in (False, True))
     mask = images.patch_means((seen - right).abs(), 32) > 0
