@@ -4,27 +4,16 @@ import struct
 from codecs import BOM_UTF8
 from pathlib import Path
 
-import hypothesis.extra.numpy as hnp
-import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from clear_strategies.data.ply import GaussianPly, read_gaussians, read_points, write_gaussians, write_points
 from clear_strategies.errors import DataError
 
-_ROUNDTRIP = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-_NUMBERS = st.floats(width=32, allow_nan=False, allow_infinity=False)
-
 
 def gaussians(n: int, bands: int, seed: int = 0) -> GaussianPly:
-    g = torch.Generator().manual_seed(seed)
-    return GaussianPly(*(torch.randn(shape, generator=g) for shape in shapes(n, bands)))
-
-
-def shapes(n: int, bands: int) -> tuple[tuple[int, ...], ...]:
-    return (n, 3), (n, 1, 3), (n, bands, 3), (n,), (n, 3), (n, 4)
+    g, shapes = torch.Generator().manual_seed(seed), ((n, 3), (n, 1, 3), (n, bands, 3), (n,), (n, 3), (n, 4))
+    return GaussianPly(*(torch.randn(shape, generator=g) for shape in shapes))
 
 
 def header(*lines: str, form: str = "binary_little_endian") -> bytes:
@@ -69,15 +58,15 @@ def test_points_that_no_file_should_hold_are_refused(tmp_path, means, colors, me
     assert not (tmp_path / "p.ply").exists()
 
 
-@_ROUNDTRIP
-@given(n=st.integers(0, 5), bands=st.sampled_from((0, 3, 8, 15)), data=st.data())
-def test_gaussians_survive_a_roundtrip_bitwise(tmp_path: Path, n: int, bands: int, data: st.DataObject) -> None:
-    arrays = [data.draw(hnp.arrays(np.float32, shape, elements=_NUMBERS)) for shape in shapes(n, bands)]
-    g = GaussianPly(*map(torch.from_numpy, arrays))
+@pytest.mark.parametrize("bands", [0, 3, 8, 15])
+@pytest.mark.parametrize("n", [0, 5])
+def test_gaussians_survive_a_roundtrip_bitwise(tmp_path: Path, n: int, bands: int) -> None:
+    g = gaussians(n, bands)
+    g.means[:2] = torch.tensor([[-0.0, 1e-45, torch.finfo(torch.float32).max]])
     write_gaussians(tmp_path / "g.ply", g)
     again = read_gaussians(tmp_path / "g.ply")
     for name in ("means", "sh0", "shN", "opacities", "scales", "quats"):
-        assert torch.equal(getattr(again, name).view(torch.int32), getattr(g, name).contiguous().view(torch.int32))
+        assert torch.equal(getattr(again, name).view(torch.int32), getattr(g, name).view(torch.int32))
 
 
 RGB = tuple(f"property uchar {name}" for name in ("red", "green", "blue"))
