@@ -171,7 +171,7 @@ def test_printed_rates_are_those_of_3dgs(chosen):
     )  # Eq. 3 adds f_det to the feature, not to its colour
 
 
-GROUPS = ("strategy", "rasterizer", "data", "prior", "objective", "density", "optim", "skips", "method")
+GROUPS = ("strategy", "rasterizer", "data", "prior", "objective", "density", "optim", "skips")
 NEEDED = {
     **{f"data={name}": "data.path=here" for name in ("blender", "colmap", "llff", "nerfstudio", "photos")},
     **{f"prior={name}": "prior.path=here" for name in ("images", "onnx")},
@@ -182,7 +182,7 @@ NEEDED = {
 @pytest.mark.parametrize("group", GROUPS)
 def test_every_option_composes_into_settings(group):
     for name in options(group):
-        chosen = f"{'+' * (group in ('strategy', 'method'))}{group}={name}"
+        chosen = f"{'+' * (group == 'strategy')}{group}={name}"
         config = composed(chosen, *([NEEDED[chosen]] if chosen in NEEDED else []))
         assert isinstance(settings_of(tree(config)).conductor(1.0), Conductor), name
 

@@ -103,7 +103,7 @@ with not_drawn():
     except SystemExit as ended:
         print("exit code", ended.code)
     hydra_app.main([*{run}, "fit.resume=auto", "fit.video=2"])
-    hydra_app.main([*{run}, "fit.overwrite=true"])
+    hydra_app.main([*{run}, "fit.overwrite=true", "fit.iterations=2"])
     hydra_app.main({sweep})
 """
 
@@ -112,7 +112,7 @@ def test_a_run_is_stopped_resumed_and_overwritten_and_a_sweep_makes_its_report(t
     (experiment := tmp_path / "conf" / "experiment" / "named.yaml").parent.mkdir(parents=True)
     experiment.write_text("# @package _global_\ndefaults: [_sweep]\n")
     run, path = ["+strategy=clear", "hydra.run.dir=one", *HERE], r"data.cloud.path=C:\photos\a:b*.ply"
-    sweep = ["+strategy=gco", "experiment=named", "--config-dir=conf", "fit.seed=0,1", path, *HERE]
+    sweep = ["+strategy=gco", "experiment=named", "--config-dir=conf", "fit.seed=0,1", path, *HERE, "fit.iterations=2"]
     result = windows.run("-c", RUNS.format(number=windows.BREAK, run=run, sweep=sweep), disk=tmp_path)
     assert result.returncode == 0, result.stdout + result.stderr
     said = (
@@ -122,7 +122,7 @@ def test_a_run_is_stopped_resumed_and_overwritten_and_a_sweep_makes_its_report(t
         "of an earlier run; removed",
     )
     assert all(words in result.stdout for words in said), result.stdout
-    assert [file.name for file in (tmp_path / "one" / "checkpoints").iterdir()] == ["step_0000013.safetensors"]
+    assert [file.name for file in (tmp_path / "one" / "checkpoints").iterdir()] == ["step_0000003.safetensors"]
     assert len(list((tmp_path / "multirun" / "named").glob("*/metrics.json"))) == 2
     assert (tmp_path / "multirun" / "named" / "report.html").is_file()
 

@@ -17,7 +17,7 @@ from clear_strategies.bench.__main__ import main
 from clear_strategies.bench.rasterizers import ATTRIBUTES
 from clear_strategies.bench.results import Results
 from clear_strategies.outputs.results import export_ply
-from tests.helpers import toy
+from tests.helpers import command_line, toy
 from tests.helpers.backends import why_not
 
 
@@ -194,7 +194,8 @@ def test_a_folder_that_cannot_be_made_is_known_before_measuring(tmp_path):
 @pytest.mark.slow
 def test_host_measures_a_loop_alone_and_with_a_strategy(tmp_path):
     asked = ["host", "--strategies", "clear", "--gaussians", "300", "--width", "16", "--repeats", "2", "--threads", "1"]
-    main([*asked, "--out", str(tmp_path)])
+    done = command_line.run(*asked, "--out", ".", cwd=tmp_path, module="clear_strategies.bench")
+    assert done.returncode == 0, done.stderr
     host, error = (pd.read_csv(tmp_path / f"{name}.csv").set_index("loop") for name in ("host", "host_error"))
     assert list(host.index) == ["alone", "clear"]
     assert host["operations"]["clear"] - host["operations"]["alone"] <= 60

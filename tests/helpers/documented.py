@@ -33,13 +33,13 @@ def your_data() -> None:
 
 
 def follow(words: list[str]) -> None:
-    """One command. Settings that make it tiny come last, but for those that it names itself."""
+    """One command. Settings that make it tiny come last, but for those that it names itself besides its length."""
     if words[:3] == ["python", "-m", "clear_strategies.run"]:
         words = ["clear-strategies", *words[3:]]
     if words[0] == "clear-strategies":
         if words[1] not in ("render", "export") and "--cfg" not in words:
             demo = words[1] != "train" and not any(word.startswith("data=") for word in words)
-            named = {word.split("=")[0] for word in words}
+            named = {word.split("=")[0] for word in words} - {"fit.iterations"}
             words = [*words, *(w for w in TINY + OF_DEMO * demo if w.split("=")[0] not in named)]
         sys.argv = words
         run.main()

@@ -198,7 +198,7 @@ def fingerprint(scene: Scene) -> str:
 
 # ---- a scene in other units trains to the same picture, and what was saved of it can be looked at
 SETTINGS = [
-    *ALONE, "prior=bicubic", "data.views.photos_are=hr", "data.views.test_every=3", "+strategy=best", "fit.iterations=60",
+    *ALONE, "prior=bicubic", "data.views.photos_are=hr", "data.views.test_every=3", "+strategy=best", "fit.iterations=30",
     "skips=none", "fit.threads=1",
 ]  # fmt: skip
 

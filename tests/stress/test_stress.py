@@ -93,7 +93,7 @@ def test_a_careless_save_or_export_would_be_found(tmp_path: Path, monkeypatch, m
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the run that is killed is a forked process")
 def test_killed_runs_end_as_one_that_was_not(tmp_path: Path) -> None:
-    kills.measure(tmp_path, 5).require()
+    kills.measure(tmp_path, 3).require()
 
 
 def test_altered_bits_and_cut_files_are_refused(tmp_path: Path) -> None:
