@@ -221,8 +221,8 @@ def test_the_readmes_loop_does_not_prune_by_size(monkeypatch):
     gsplat_loop = pytest.importorskip("integration.examples.gsplat_loop")
     strategy = Mock(side_effect=StopIteration)
     monkeypatch.setattr(gsplat_loop, "DefaultStrategy", strategy)
-    for name in ("load_demo", "stereo"):
-        monkeypatch.setattr(gsplat_loop, name, MagicMock())
+    for first in ("load_demo", "stereo"):
+        monkeypatch.setattr(gsplat_loop, first, MagicMock())
     monkeypatch.setattr(gsplat_loop, "splats_with_optimizers", lambda *_: ({}, {}))
     with pytest.raises(StopIteration):
         gsplat_loop.train(30_000, "best")

@@ -203,8 +203,8 @@ def _is_setting(override: str) -> bool:
 
 
 def _in_order(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
-    """Folder by folder, in each the runs without a sweep, then its sweeps by the end of their first jobs, their jobs by number. The
-    jobs of a sweep have the same keys; of two with the same number, the later one begins another sweep.
+    """Folder by folder: in each the runs without a sweep, then its sweeps by the end of their first jobs, their jobs by number.
+    The jobs of a sweep have the same keys; of two with the same number, the later one begins another sweep.
     """
     sweeps, latest = list[dict[int, FinishedRun]](), dict[Any, dict[int, FinishedRun]]()
     for run in sorted(runs, key=lambda run: ("", 0) if run.job is None else (run.ended, run.job)):
