@@ -178,10 +178,11 @@ def test_importing_is_light_and_of_the_package_alone_imports_no_torch():
     assert result.returncode == 0, result.stderr
 
 
-def test_training_without_what_it_needs_says_what_to_install(tmp_path):
+@pytest.mark.parametrize("arguments", [["+strategy=clear"], ["train", "."]])
+def test_training_without_what_it_needs_says_what_to_install(arguments, tmp_path):
     missing = HEAVY - {"gsplat", "hydra", "nerfstudio", "open3d", "warp"}
     code = (
-        f"import sys; sys.modules |= dict.fromkeys({missing}); sys.argv = ['clear-strategies', '+strategy=clear']; "
+        f"import sys; sys.modules |= dict.fromkeys({missing}); sys.argv = ['clear-strategies', *{arguments}]; "
         "from clear_strategies.run import main; main()"
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False)

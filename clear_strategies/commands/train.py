@@ -15,6 +15,7 @@ from typing import Final
 
 from clear_strategies.commands import is_of_hydra, path_of
 from clear_strategies.errors import SettingError
+from clear_strategies.jobs import exit_codes
 
 # Training uses photos of up to two megapixels, for which an iteration takes about half a second of a core.
 _ITERATIONS: Final = 1000
@@ -73,6 +74,7 @@ def overrides(arguments: Sequence[str]) -> list[str]:
         raise SettingError(
             f"train: {others[0]} is a second folder. Put all photos of the scene into one folder, and give that."
         )
+    exit_codes.require("train")
     from clear_strategies.compose import quoted
     from clear_strategies.jobs.resume import begun
 
