@@ -27,7 +27,7 @@ from clear_strategies.data.cloud import CloudSettings, initial_points, require_s
 from clear_strategies.data.lenses import forget_maps
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.priors import Bicubic, Prior
-from clear_strategies.data.priors.interface import kept_network_of, super_resolved, warn_if_far_from_lr
+from clear_strategies.data.priors.interface import cached, network_of, super_resolved, warn_if_far_from_lr
 from clear_strategies.data.scene import Scene, require_shown
 from clear_strategies.data.scene_notes import scene_notes, size_of
 from clear_strategies.data.view_names import ViewFiles, write_pngs
@@ -191,7 +191,8 @@ def _enlarged(
     """Enlarge transparency to HR, by the prior's network; by bicubic without a network, or if every pixel is opaque."""
     if transparency is None:
         return None
-    enlarge = (kept_network_of(prior) if bool(transparency.any()) else None) or Bicubic()
+    network = network_of(prior) if bool(transparency.any()) else None
+    enlarge = Bicubic() if network is None else cached(network)
     return enlarge(name, images.as_rgb(transparency), factor).mean(dim=2)
 
 

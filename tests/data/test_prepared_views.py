@@ -14,7 +14,7 @@ from clear_strategies.data import photo_files
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.prepare import prepare, truth_of
-from clear_strategies.data.priors import BackProjected, Bicubic, Cached, DemoPrior
+from clear_strategies.data.priors import BackProjected, Bicubic, DemoPrior
 from clear_strategies.data.readers import blender, demo
 from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
@@ -159,14 +159,14 @@ def test_the_colour_of_transparent_pixels_makes_no_fringe_where_photos_are_reduc
             assert float((image.amax(2) - image.amin(2)).max()) < 1.5 / 255
 
 
-def test_a_network_enlarges_the_transparency_of_a_photo_once(tmp_path):
+def test_a_network_enlarges_the_transparency_of_a_photo_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("CLEAR_CACHE", str(tmp_path))
     network = Counting()
     half = torch.full((16, 16), 0.5)
     (frame,) = capture(1).frames
     glass = Capture("glass", (replace(frame, load=lambda: replace(frame.load(), transparency=half)),))
     for _ in range(2):
-        prior = BackProjected(Cached(network, tmp_path))
-        made = prepare(glass, papers(train=1, test_every=0), prior, POINTS).train[0]
+        made = prepare(glass, papers(train=1, test_every=0), BackProjected(network), POINTS).train[0]
         assert float((made.hr.transparency - 0.5).abs().max()) <= 1.01 / 255
     assert network.calls == ["0000.png"] * 2  # the photo and its transparency
 

@@ -9,7 +9,6 @@ import hashlib
 import logging
 import os
 import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
@@ -86,19 +85,9 @@ class Network(Prior, Protocol):
 
 def network_of(prior: object) -> Network | None:
     """The network that a prior is or decorates; None if there is none."""
-    return next((inner for inner in layers(prior) if isinstance(inner, Network)), None)
-
-
-def kept_network_of(prior: object) -> Prior | None:
-    """The network that a prior is or decorates, as of `network_of`, but with its cache if it has one."""
-    return next((inner for inner in layers(prior) if isinstance(inner, Network | Cached)), None)
-
-
-def layers(prior: object) -> Iterator[object]:
-    """A prior, the prior that it decorates, and so on."""
-    while prior is not None:
-        yield prior
+    while not (prior is None or isinstance(prior, Network)):
         prior = getattr(prior, "prior", None)
+    return prior
 
 
 def cache_folder() -> Path:
