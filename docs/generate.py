@@ -96,7 +96,9 @@ class Api:
 
     def __init__(self, listed: list[Group]) -> None:
         import griffe
+        from griffe2md import prepare_env
 
+        self._templates = prepare_env()  # of all items: to compile them takes most of the time
         loader = griffe.GriffeLoader(
             search_paths=[ROOT],
             docstring_parser=griffe.Parser.google,
@@ -113,7 +115,7 @@ class Api:
 
     def __call__(self, name: str, members: str | None) -> str:
         """Without members (`alone`), with some of them (`with ONE OTHER`), or with all (None)."""
-        from griffe2md import ConfigDict, render_object_docs
+        from griffe2md import ConfigDict, prepare_context
 
         item = self._item(name)
         self._shorten(item)
@@ -123,7 +125,10 @@ class Api:
             show_if_no_docstring=False, show_bases=False, inherited_members=False, summary=False,
             members=None if members is None else members.split()[1:],
         )  # fmt: skip
-        text = render_object_docs(item, options)  # its links lead to places of a site that has every object
+        template = self._templates.get_template(f"{item.kind.value}.md.jinja")
+        text = template.render(
+            **prepare_context(item, options)
+        )  # its links lead to places of a site that has every object
         return re.sub(r"<code>(.*?)</code>", r"`\1`", re.sub(r"\[([^\[\]]*)\]\(#[^)]*\)", r"\1", text)).strip() + "\n"
 
     def _item(self, name: str) -> Any:

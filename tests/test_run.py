@@ -9,7 +9,7 @@ import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 import pytest
 
@@ -256,6 +256,15 @@ def test_a_run_trains_on_where_who_reads_its_output_has_left(read, tmp_path):
     assert "done in" in (tmp_path / "here/run.log").read_text()
 
 
+ASCII = (
+    "import runpy, sys\n"
+    "sys.stdout = sys.__stdout__ = open(1, 'w', encoding='ascii', closefd=False)\n"
+    "sys.stderr = sys.__stderr__ = open(2, 'w', encoding='ascii', closefd=False)\n"
+    "module = sys.argv.pop(1)\n"
+    "sys.modules.pop(module, None)\n"
+    "runpy.run_module(module, run_name='__main__', alter_sys=True)\n"
+)
+"""A program whose console has ascii alone: it runs the module that its first argument names."""
 QUICK = {
     "clear_strategies.run": ["--help", "train nowhere-ü"], "clear_strategies.report": ["nowhere-ü"],
     "clear_strategies.bench": ["--help"], "integration.inria": ["nowhere-ü.py"],
@@ -263,37 +272,33 @@ QUICK = {
 LINES = [(module, line) for module, lines in QUICK.items() for line in lines]
 
 
-def command(module: str, line: str, cwd: Path, **streams: Any) -> subprocess.CompletedProcess[bytes]:
-    """A command whose console has ascii alone."""
-    words, env = [sys.executable, "-m", module, *line.split()], {**environment(cwd), "PYTHONIOENCODING": "ascii"}
-    return subprocess.run(words, cwd=cwd, env=env, check=False, **{"stderr": subprocess.PIPE, **streams})
+def command(module: str, line: str, folder: Path, **streams: TextIO) -> tuple[int, str]:
+    """The exit code of a command and what it says on the streams that are not given."""
+    with (folder / "said").open("w") as said:
+        streams = {"stdout": said, "stderr": said, **streams}
+        code = Forked("-c", ASCII, module, *line.split(), cwd=folder, env=environment(folder), **streams).wait()
+    return code, (folder / "said").read_text()
 
 
 @pytest.mark.parametrize(("module", "line"), LINES, ids=map(" ".join, LINES))
 def test_a_command_ends_as_always_on_a_console_without_its_letters_and_without_a_reader(module, line, tmp_path):
     with gone() as pipe:
-        ended = command(module, line, tmp_path, stdout=pipe)
-    assert ended.returncode == (0 if "--help" in line else 2), ended
-    assert ended.stderr == b"" if "--help" in line else b"nowhere-\\xfc" in ended.stderr, ended
-    assert b"Traceback" not in ended.stderr
+        code, said = command(module, line, tmp_path, stdout=pipe)
+    assert code == (0 if "--help" in line else 2), said
+    assert said == "" if "--help" in line else "nowhere-\\xfc" in said
+    assert "Traceback" not in said
 
 
 def test_letters_that_the_console_lacks_are_escaped_and_an_error_that_nobody_reads_has_its_exit_code(tmp_path):
-    assert (
-        b"[setting=value \\u2026]" in command("clear_strategies.run", "--help", tmp_path, stdout=subprocess.PIPE).stdout
-    )
+    assert "[setting=value \\u2026]" in command("clear_strategies.run", "--help", tmp_path)[1]
     with gone() as pipe:
-        assert command("clear_strategies.run", "train nowhere-ü", tmp_path, stderr=pipe).returncode == 2
+        assert command("clear_strategies.run", "train nowhere-ü", tmp_path, stderr=pipe)[0] == 2
 
 
 def test_a_run_on_an_ascii_console_writes_into_folders_of_any_letters_and_of_the_users(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    ascii_console = (
-        "import sys\nfor stream in (sys.stdout, sys.stderr):\n    stream.reconfigure(encoding='ascii', errors='strict')\n"
-        "from clear_strategies.run import main\nmain()\n"
-    )
     arguments = ["+strategy=gco", *TINY, "fit.iterations=3", "hydra.run.dir=~/ü"]
-    process = started("-c", ascii_console, *arguments, cwd=tmp_path, said=tmp_path / "said")
+    process = started("-c", ASCII, "clear_strategies.run", *arguments, cwd=tmp_path, said=tmp_path / "said")
     assert process.wait() == 0, (tmp_path / "said").read_bytes()
     assert (tmp_path / "home/ü/metrics.json").is_file()
     assert b"home/\\xfc/contact_sheet.jpg" in (tmp_path / "said").read_bytes()
@@ -308,4 +313,5 @@ def test_a_program_that_was_started_without_stdout_ends_as_always(tmp_path):
 
 def test_what_a_full_disk_takes_of_the_output_is_told(tmp_path):
     with Path("/dev/full").open("w") as full:
-        assert command("clear_strategies.run", "--help", tmp_path, stdout=full).returncode == 3
+        words = [sys.executable, "-m", "clear_strategies.run", "--help"]
+        assert subprocess.run(words, cwd=tmp_path, env=environment(tmp_path), stdout=full, check=False).returncode == 3

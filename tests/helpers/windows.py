@@ -64,6 +64,7 @@ def run(*arguments: str, disk: Path) -> subprocess.CompletedProcess[str]:
 
 def begin() -> None:
     """From here on this process is on Windows."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     own: dict[str, dict[str, Any]] = {
         "multiprocessing": {"get_all_start_methods": lambda: ["spawn"]},
         "os": {"fsync": _fsync, "kill": _kill, "name": "nt", "open": _open},
