@@ -29,7 +29,7 @@ from clear_strategies.options import CONF
 from clear_strategies.training import loop
 from tests.helpers import command_line, documented, short_run, toy
 from tests.helpers.compiled_step_cases import ALWAYS
-from tests.helpers.configs import jobs_of, loader
+from tests.helpers.configs import composed, jobs_of, loader
 from tests.helpers.pages import DOCS, OURS, PAGES, ROOT, blocks, commands, loaded, name
 
 # Each command once, by the first page that has it.
@@ -82,10 +82,10 @@ def require_composable(arguments: list[str]) -> None:
     overrides = [word for word in arguments if "=" in word or word.startswith("~")]
     flags = [word for word in arguments if word not in overrides]
     assert set(flags) <= {"-m", "--cfg", "job", "--resolve"}, flags
-    whole = loader().load_configuration("config", overrides, run_mode=RunMode.MULTIRUN, validate_sweep_overrides=False)
-    if "-m" not in flags and whole.hydra.mode != RunMode.MULTIRUN:
-        require_conductor(loader().load_configuration("config", overrides, run_mode=RunMode.RUN))
+    if "-m" not in flags and not any(word.startswith("experiment=") for word in overrides):
+        require_conductor(composed(*overrides))
         return
+    whole = loader().load_configuration("config", overrides, run_mode=RunMode.MULTIRUN, validate_sweep_overrides=False)
     for i, job in enumerate(jobs_of(whole, overrides)):
         files = {word for word in job if (CONF / word.lstrip("+").split("=")[0]).is_dir()}
         if i == 0 or files - TAKEN:  # the first job, and each that takes a file that no job before it took

@@ -256,9 +256,6 @@ def test_one_command_runs_all_its_report_tells_the_rows_apart_and_a_rerun_trains
     done = sorted(p.parent.name.split(",")[0] for p in tmp_path.glob("multirun/table5/*/metrics.json"))
     assert done == ["+method=srgs", "+strategy=baseline", "+strategy=clear"]
     swept = tmp_path / "multirun" / "table5"  # a sweep ends with its report
-    assert "| srgs " in (swept / "report.md").read_text()
+    table = (swept / "report.md").read_text()
+    assert all(f"| {row} " in table for row in ("baseline", "clear", "srgs")), table
     assert (swept / "report.html").is_file()
-    told = run("multirun", "--out", "report", cwd=tmp_path, module="clear_strategies.report")
-    assert told.returncode == 0, told.stderr
-    for row in ("| baseline ", "| clear ", "| srgs "):
-        assert row in told.stdout, told.stdout

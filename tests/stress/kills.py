@@ -1,26 +1,17 @@
 """A real run is killed at random moments, started again, and killed again; at its end it has the bits of one that never was.
 
-The job runs in a forked child of a process that has already imported everything, so that a kill costs a fraction of a second.
+A run is forked off a process that has already imported everything, so that a kill costs a fraction of a second.
 """
 
-import logging
-import os
 import random
-import signal
 import time
-import traceback
 from pathlib import Path
 
-import torch
-from omegaconf import DictConfig
-
 from clear_strategies.errors import DataError
-from clear_strategies.jobs import job
 from clear_strategies.jobs.resume import CHECKPOINTS
 from clear_strategies.training import checkpoint
-from tests.helpers import forked
-from tests.helpers.command_line import TINY
-from tests.helpers.configs import composed
+from tests.helpers.command_line import TINY, started
+from tests.helpers.forked import Forked
 from tests.stress.rows import Row, Worst
 
 # Every event of a run and a checkpoint every third iteration.
@@ -32,27 +23,25 @@ _RUN = [
 _MOST_KILLS = 6  # of one run, before it may end
 
 
-@forked.not_drawn()
 def measure(folder: Path, kills: int) -> Row:
     """Kill runs `kills` times in all; a failure is a checkpoint lost, a rest after the end, or another result."""
-    config = composed(*_RUN)
-    job.run(config, folder / "warm")  # in this process, so that its children need not import anything
+    _require_done(_started(folder / "warm"))  # the process that forks imports meanwhile
     began = time.monotonic()
-    _require_done(_started(config, folder / "whole"))
+    _require_done(_started(folder / "whole"))
     seconds = time.monotonic() - began
     expected, rng, failures, run = _results(folder / "whole"), random.Random(0), Worst(), 0  # noqa: S311 - no secret
     while failures.cases < kills:
         run_folder, newest, run = folder / f"run{run}", 0, run + 1
         for _ in range(min(rng.randint(1, _MOST_KILLS), kills - failures.cases)):
             delay = rng.uniform(0, seconds)
-            pid = _started(config, run_folder)
+            process = _started(run_folder)
             time.sleep(delay)
-            os.kill(pid, signal.SIGKILL)
-            os.waitpid(pid, 0)
+            process.kill()
+            process.wait()
             t = _newest(run_folder)
             failures.add(float(t is None or t < newest), f"run {run}, killed after {delay:.2f} s: a checkpoint is lost")
             newest = t or newest
-        _require_done(_started(config, run_folder))
+        _require_done(_started(run_folder))
         same, rests = _results(run_folder) == expected, _rests(run_folder)
         failures.add_to_last(
             float(not same or bool(rests)), f"run {run}: {'another result' if not same else f'left {rests}'}"
@@ -62,25 +51,13 @@ def measure(folder: Path, kills: int) -> Row:
     )
 
 
-def _started(config: DictConfig, folder: Path) -> int:
-    """The process that runs the job."""
-    if pid := os.fork():
-        return pid
-    code = 1
-    try:
-        logging.disable(logging.CRITICAL)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the progress bar writes to stderr, where errors go as well
-        torch.set_num_threads(1)
-        job.run(config, folder)
-        code = 0
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        os._exit(code)
+def _started(folder: Path) -> Forked:
+    where = f"hydra.run.dir={folder.name}"
+    return started("-m", "clear_strategies.run", *_RUN, where, cwd=folder.parent, said=folder.with_suffix(".said"))
 
 
-def _require_done(pid: int) -> None:
-    if code := os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]):
+def _require_done(process: Forked) -> None:
+    if code := process.wait():
         raise RuntimeError(f"the run that nobody killed ended with {code}")
 
 
