@@ -126,9 +126,8 @@ class Api:
             members=None if members is None else members.split()[1:],
         )  # fmt: skip
         template = self._templates.get_template(f"{item.kind.value}.md.jinja")
-        text = template.render(
-            **prepare_context(item, options)
-        )  # its links lead to places of a site that has every object
+        text = template.render(**prepare_context(item, options))
+        # Its links lead to places of a site that has every object.
         return re.sub(r"<code>(.*?)</code>", r"`\1`", re.sub(r"\[([^\[\]]*)\]\(#[^)]*\)", r"\1", text)).strip() + "\n"
 
     def _item(self, name: str) -> Any:
