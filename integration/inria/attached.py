@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,11 +20,10 @@ from integration.attachment import Attachment
 from integration.autograd_shot import HostOutput, Target
 from integration.densification import require_end, warn_if_score_is_unused
 from integration.detail import sh0_offset
-from integration.graph import graph_of
 from integration.host import Host
 from integration.inria.cameras import HostViews, enlarged_camera, replaced_camera
 from integration.inria.detail import DetailFeature
-from integration.inria.rendering import host_output
+from integration.inria.model_proxy import Overrides, host_output, proxy
 from integration.inria.rows import CarriedRows
 from integration.replacing import replaced_attribute, replaced_everywhere, replaced_methods
 from integration.settings import Settings
@@ -125,7 +123,6 @@ class Attached:
             "training_setup": self._training_setup, "relocate_gs": self._relocate,
         }))  # fmt: skip
         self._black: bool | None = None  # the host's background, once it is known
-        self._is_showing = self._shows_detail = False  # now; at least once
         self._hooks: list[Any] = []
         self._hook_optimizer()
 
@@ -141,12 +138,12 @@ class Attached:
         @uncompiled
         def wrapped(viewpoint_camera: Any, pc: Any, *args: Any, **kwargs: Any) -> Any:
             other_colors = kwargs.get("override_color") is not None  # depth, normals: no photo
-            if self.attachment.removed or pc is not self._model or other_colors or self._is_showing:
+            if self.attachment.removed or pc is not self._model or other_colors:
                 return render(viewpoint_camera, pc, *args, **kwargs)
             view = self.views.find(viewpoint_camera) if torch.is_grad_enabled() else None
             if view is None:  # evaluation, a viewer, a camera without a photo
-                with self._showing(None, self.detail.value.detach() if self._trains_detail else None):
-                    return render(viewpoint_camera, pc, *args, **kwargs)
+                shown = Overrides(detail=self.detail.value.detach() if self._trains_detail else None)
+                return render(viewpoint_camera, proxy(self._model, shown), *args, **kwargs)
             if kwargs.get("subpixel_offset") is not None:
                 raise HostError(
                     "rays are jittered, and two scales of a view cannot share that. Train without ray_jitter."
@@ -158,13 +155,14 @@ class Attached:
             def render_at(target: Target, gate: Tensor | None, sized: View) -> HostOutput:
                 camera, pinhole = self._camera_of(target, viewpoint_camera, sized)
                 params = self.params() if target == "hr" else self._host_params()
-                call = signature.bind(camera, pc, *args, **kwargs)
+                overrides = Overrides(gate, params.get("detail"))
+                call = signature.bind(camera, proxy(self._model, overrides), *args, **kwargs)
                 call.arguments |= self._bg_color(call.arguments.get("bg_color"))
-                with collected_drawings() as drawings, self._showing(gate, params.get("detail")):
+                with collected_drawings() as drawings:
                     result = render(*call.args, **call.kwargs)
                 ranks = hasattr(self._model, "xyz_gradient_accum_abs")
                 output = host_output(result, pinhole, params, gate, drawings, ranks_by_third_column=ranks)
-                self._warn_of_what_has_no_effect(output)
+                self._warn_of_what_was_not_read(overrides, output)
                 return output
 
             output = self.attachment.render_view(view, render_at)
@@ -195,31 +193,6 @@ class Attached:
     def _host_params(self) -> dict[str, Tensor]:
         return {name: getattr(self._model, attribute) for name, attribute in _ATTRIBUTES.items()}
 
-    @contextmanager
-    def _showing(self, gate: Tensor | None, detail: Tensor | None) -> Iterator[None]:
-        """A context in which the model has opacities times the gate, and f_base + f_det. All forks activate opacities by this
-        function, whatever else their getters do with them. What renders inside of a rendering is the host's own.
-        """
-        model, used = self._model, set[str]()
-        activate: Any = getattr(model, "opacity_activation", None)
-
-        def gated(x: Tensor) -> Any:
-            if gate is None or x is not model._opacity:
-                return activate(x)
-            used.add("gate")
-            return activate(x) * gate.to(x).view(-1, *[1] * (x.dim() - 1))
-
-        with ExitStack() as shown:
-            shown.enter_context(replaced_attribute(self, "_is_showing", True))
-            if gate is not None and activate is not None:
-                shown.enter_context(replaced_attribute(model, "opacity_activation", gated))
-            if detail is not None:
-                colours = model._features_dc + sh0_offset(detail, model._features_dc)
-                shown.enter_context(replaced_attribute(model, "_features_dc", colours))
-            yield
-        if gate is not None and not used:
-            self._warn_once("render does not activate the model's opacities: dropout has no effect.")
-
     def _require_pose_of_camera(self, call: Mapping[str, Any]) -> None:
         """InstantSplat's render takes its pose from an argument, not from the camera."""
         making = [type(s).__name__ for s in self.attachment.conductor.showing]
@@ -235,12 +208,12 @@ class Attached:
             return replaced_camera(camera, target), target
         return (camera, view.lr.camera) if target == "lr" else (enlarged_camera(camera, view.factor), view.hr.camera)
 
-    def _warn_of_what_has_no_effect(self, output: HostOutput) -> None:
-        scoring, detail = self.attachment.conductor.owner("score"), output.shot.params.get("detail")
-        if detail is not None and detail.requires_grad and not self._shows_detail:
-            self._shows_detail = graph_of(output.shot.image).reaches([detail])
-            if not self._shows_detail:
-                self._warn_once("render does not read the model's constant colours: the detail feature has no effect.")
+    def _warn_of_what_was_not_read(self, overrides: Overrides, output: HostOutput) -> None:
+        scoring = self.attachment.conductor.owner("score")
+        if overrides.gate is not None and "gate" not in overrides.used:
+            self._warn_once("render reads none of the model's opacity getters: dropout has no effect.")
+        if overrides.detail is not None and "detail" not in overrides.used:
+            self._warn_once("render does not read the model's constant colours: the detail feature has no effect.")
         if output.shot.gradient_slot.tensor.shape[-1] == 4 and scoring is not None:
             self._warn_once(
                 "viewspace_points have 4 columns: absolute gradients stay those of the LR image, and the densification "
@@ -306,7 +279,9 @@ class Attached:
 
     def _save_with_detail(self, save: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """`save_ply` with f_det in the colours of the file."""
-        with self._showing(None, self.detail.value.detach()):
+        trained = self._model._features_dc
+        shown = torch.nn.Parameter(trained.detach() + sh0_offset(self.detail.value.detach(), trained))
+        with replaced_attribute(self._model, "_features_dc", shown):
             return save(*args, **kwargs)
 
 

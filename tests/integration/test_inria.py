@@ -28,7 +28,6 @@ from integration.inria.cameras import HostViews, intrinsics
 from integration.inria.from_options import install
 from rasterizers import Splats, autograd
 from rasterizers.differentiable import outer
-from rasterizers.geometry import SH_C0
 from tests.helpers import toy
 from tests.helpers.gsplat_host import RASTERIZER, doubled, in_double
 from tests.helpers.host_parts import FOLDER, FROM_START, HR_FROM_START, WITHOUT_HR, N, loop, options
@@ -317,42 +316,11 @@ def test_a_network_before_the_rasterizer_learns_from_both_scales(inria_host, inr
     assert float((other["network"] - of_lr["network"]).abs().max()) > 0.1 * float(of_lr["network"].abs().max())
 
 
-def test_opacities_are_gated_and_f_det_is_added_once_however_getters_call_each_other_also_inside_of_a_rendering(
-    inria_host, inria_attached, monkeypatch
-):
-    """As in Mip-Splatting."""
-    clear, gaussians, scene = inria_attached(SVS(dropout=Ramp(maximum=0.5, shape="constant")))
-    model, camera, seen = type(gaussians), scene.cameras[0], []
-    plain, z = gaussians.get_opacity.detach(), clear.attachment.conductor.gate(1, N)[:, None]
-    monkeypatch.setattr(
-        model, "get_opacity_with_3D_filter", property(lambda self: 0.5 * self.get_opacity), raising=False
-    )
-    clear.detail.value.data.fill_(0.1)
-
-    def render(viewpoint, pc, *more, inside=False):
-        if not inside:
-            wrapped(viewpoint, pc, *more, inside=True)
-        seen.append((pc.get_opacity_with_3D_filter.detach(), pc.get_features[:, 0].detach() - gaussians.kept))
-        return inria_host.render(viewpoint, pc, *more)
-
-    gaussians.kept, wrapped = gaussians._features_dc[:, 0].detach(), clear.wrap(render)
-    wrapped(camera, gaussians, None, None)
-    assert len(seen) == 4
-    assert clear.attachment.counts["LR renders"] == 1
-    for i, (opacities, offset) in enumerate(seen):
-        assert torch.equal(opacities, 0.5 * plain * z)
-        torch.testing.assert_close(offset, torch.full((N, 3), 0.1 / SH_C0 if i < 2 else 0.0))  # HR, then LR
-    assert torch.equal(gaussians.get_opacity, plain)
-
-
-def test_a_renderer_that_reads_neither_opacities_nor_colours_is_warned_of(
-    inria_host, caplog, inria_attached, monkeypatch
-):
-    clear, gaussians, scene = inria_attached(SVS(dropout=Ramp(maximum=0.2, shape="constant")))
-    colours = gaussians.get_features
-    monkeypatch.setattr(type(gaussians), "get_opacity", property(lambda self: self._opacity.sigmoid()))
-    monkeypatch.setattr(type(gaussians), "get_features", property(lambda self: colours))
-    clear.wrap(inria_host.render)(scene.cameras[0], gaussians, None, None)
+def test_a_renderer_that_does_not_read_the_getters_is_warned_of(inria_host, caplog, inria_attached):
+    always = SVS(dropout=Ramp(maximum=0.2, shape="constant"))
+    clear, gaussians, scene = inria_attached(always)
+    render = clear.wrap(lambda camera, pc, pipe, background: inria_host.render(camera, gaussians, pipe, background))
+    render(scene.cameras[0], gaussians, None, None)
     assert "dropout has no effect" in caplog.text
     assert "detail feature has no effect" in caplog.text
 

@@ -1,4 +1,4 @@
-"""Which Gaussian came from which in a GaussianModel."""
+"""Which Gaussian came from which in a GaussianModel, and the proxy of one that changes opacities and colours once."""
 
 from types import SimpleNamespace
 
@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from integration.inria.cameras import enlarged_camera
+from integration.inria.model_proxy import Overrides, proxy
 from integration.inria.rows import CarriedRows, find_change
+from rasterizers.geometry import SH_C0
 from tests.helpers import toy
 from tests.helpers.host_parts import N, loop, options
 
@@ -164,6 +166,52 @@ def test_many_gaussians_of_one_colour_need_no_memory_for_all_their_distances(mon
     monkeypatch.setattr(torch, "cdist", lambda a, b: sizes.append(len(a) * len(b)) or cdist(a, b))
     assert find_change(before, after).parents.tolist() == [*range(40), *range(40)]
     assert max(sizes) <= 120
+
+
+# ---- a proxy of a host's model: opacities and colours are changed once, however the host's getters call each other
+class Model:
+    """Getters as in Mip-Splatting, where one calls another."""
+
+    def __init__(self):
+        g = torch.Generator().manual_seed(0)
+        self._opacity, self._features_dc = torch.randn(N, 1, generator=g), torch.randn(N, 1, 3, generator=g)
+        self.scaling = torch.rand(N, 3, generator=g)
+
+    @property
+    def get_opacity(self):
+        return self._opacity.sigmoid()
+
+    @property
+    def get_opacity_with_3D_filter(self):
+        return 0.5 * self.get_opacity
+
+    @property
+    def get_scaling_n_opacity_with_3D_filter(self):
+        return 2 * self.scaling, self.get_opacity_with_3D_filter
+
+    @property
+    def get_features(self):
+        return torch.cat((self._features_dc, torch.zeros(N, 3, 3)), 1)
+
+
+def test_opacities_are_gated_once_and_the_detail_feature_is_added_to_the_constant_band():
+    model, z = Model(), torch.arange(N) / N
+    overrides = Overrides(gate=z)
+    gated = proxy(model, overrides)
+    assert isinstance(gated, Model)
+    expected = 0.5 * model.get_opacity * z[:, None]
+    assert torch.equal(gated.get_opacity_with_3D_filter, expected)
+    scales, opacities = gated.get_scaling_n_opacity_with_3D_filter
+    assert torch.equal(opacities, expected)
+    assert torch.equal(scales, 2 * model.scaling)
+    assert overrides.used == {"gate"}
+    model = Model()
+    difference = proxy(model, Overrides(detail=torch.ones(N, 3))).get_features - model.get_features
+    assert torch.allclose(difference[:, 0], torch.full((N, 3), 1 / SH_C0))
+    assert bool((difference[:, 1:] == 0).all())
+    del model._features_dc
+    with pytest.raises(AttributeError, match="'Model' object has no attribute '_features_dc'"):
+        _ = proxy(model, Overrides())._features_dc
 
 
 def test_only_pixel_sizes_of_a_camera_are_enlarged():

@@ -32,7 +32,8 @@ from clear_strategies.data.ply import write_points
 from clear_strategies.errors import SettingError
 from clear_strategies.strategies import random_background
 from integration.nerfstudio import clear_splatfacto
-from integration.nerfstudio.method import ClearSplatfactoModel, ClearSplatfactoModelConfig
+from integration.nerfstudio.data import seed_with_stereo
+from integration.nerfstudio.method import ClearDatamanager, ClearSplatfactoModel, ClearSplatfactoModelConfig
 from rasterizers import autograd
 from rasterizers.geometry import SH_C0
 
@@ -173,6 +174,23 @@ def test_nerfstudios_trainer_trains_it(capture, tmp_path, monkeypatch, clear):
     assert float(model.gauss_params["detail"].abs().max()) > 0
     assert model.attached is None
     assert splatfacto.rasterization is rasterization
+
+
+def test_it_starts_from_the_stereo_cloud_of_its_photos(capture, tmp_path):
+    config = configured(capture, tmp_path, strategies="svs", stop_split_at=0)
+    config.pipeline.datamanager.points = "stereo"
+    host = trainer(config)
+    model, manager = host.pipeline.model, host.pipeline.datamanager
+    assert isinstance(manager, ClearDatamanager)
+    cloud = seed_with_stereo(manager)
+    assert torch.equal(model.gauss_params["means"], cloud.means)
+    colors = model.gauss_params["features_dc"].detach() * SH_C0 + 0.5
+    assert torch.allclose(colors, cloud.colors, atol=1 / 255)
+    for name, p in model.gauss_params.items():
+        assert len(p) == len(cloud), name
+        assert host.optimizers.optimizers[name].param_groups[0]["params"][0] is p, name
+    host.train()
+    assert bool(model.gauss_params["means"].isfinite().all())
 
 
 def test_it_starts_from_the_data_sets_points_by_default_and_in_evaluation(capture, tmp_path):

@@ -24,7 +24,6 @@ class BasicPointCloud(NamedTuple):
 class GaussianModel:
     def __init__(self):
         self.active_sh_degree, self.max_sh_degree, self.optimizer = 0, 3, None
-        self.opacity_activation = torch.sigmoid
 
     def create_from_pcd(self, pcd: BasicPointCloud, spatial_lr_scale: float):
         self.spatial_lr_scale = spatial_lr_scale
@@ -73,7 +72,7 @@ class GaussianModel:
 
     @property
     def get_opacity(self):
-        return self.opacity_activation(self._opacity)
+        return self._opacity.sigmoid()
 
     def oneupSHdegree(self):
         self.active_sh_degree = min(self.active_sh_degree + 1, self.max_sh_degree)

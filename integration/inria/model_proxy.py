@@ -1,9 +1,14 @@
-"""What 3DGS and its forks' `render` returns, as a `HostOutput`."""
+"""`render` of 3DGS and its forks takes the whole model: render it with gated opacities and with f_det in its colours, at LR or
+HR.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache, partial
+from typing import Any, Final, Literal
 
 import torch
 from jaxtyping import Float
@@ -11,9 +16,81 @@ from torch import Tensor
 
 from clear_strategies.errors import HostError
 from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot
+from integration.detail import sh0_offset
 from rasterizers.differentiable import Drawing
 from rasterizers.interface import Camera
 from rasterizers.torch_internals import base_of
+
+Role = Literal["gate", "detail"]
+"""The changes of an override: opacities are multiplied by the gate, colours are offset by f_det."""
+_ROLES: Final[Mapping[str, Role]] = {
+    "get_opacity": "gate", "get_opacity_with_3D_filter": "gate", "get_scaling_n_opacity_with_3D_filter": "gate",
+    "_features_dc": "detail",
+}  # fmt: skip
+"""A model's getters, methods and attributes, those that it has. Of role "gate" are opacities (or a tuple that ends with them), of
+role "detail" is the constant band of the colours.
+"""
+
+
+@dataclass(slots=True, eq=False)
+class Overrides:
+    """What a proxy changes in its model.
+
+    Args:
+        gate: z, a factor of every opacity; None: opacities stay.
+        detail: f_det, an offset of every colour; None: colours stay.
+        used: the roles that the host has read.
+        active: roles whose getter is running; getters that it calls are not changed a second time.
+    """
+
+    gate: Float[Tensor, " N"] | None = None
+    detail: Float[Tensor, "N 3"] | None = None
+    used: set[Role] = field(default_factory=set)
+    active: set[Role] = field(default_factory=set)
+
+    def of(self, role: Role, get: Callable[[], Any]) -> Any:
+        """What `get` returns, changed once."""
+        if role in self.active:
+            return get()
+        self.active.add(role)
+        try:
+            return _apply(get(), self, role)
+        finally:
+            self.active.discard(role)
+
+
+def proxy(model: Any, overrides: Overrides) -> Any:
+    """An object of the model's class that shares its attributes and applies the overrides."""
+    result: Any = object.__new__(_proxy_class(type(model)))  # type: ignore[arg-type]
+    object.__setattr__(result, "__dict__", vars(model))
+    object.__setattr__(result, "_clear_overrides", overrides)
+    return result
+
+
+@cache
+def _proxy_class(cls: Any) -> Any:
+    def read(self: Any, name: str) -> Any:
+        get = partial(cls.__getattribute__, self, name)
+        if (role := _ROLES.get(name)) is None:
+            return get()
+        overrides: Overrides = cls.__getattribute__(self, "_clear_overrides")
+        if inspect.isroutine(inspect.getattr_static(cls, name, None)):
+            return lambda *args, **kwargs: overrides.of(role, lambda: get()(*args, **kwargs))
+        return overrides.of(role, get)
+
+    members = {"__slots__": ("_clear_overrides",), "__module__": cls.__module__, "__getattribute__": read}
+    return type(cls.__name__, (cls,), members)
+
+
+def _apply(value: Any, overrides: Overrides, role: Role) -> Any:
+    overrides.used.add(role)
+    if isinstance(value, tuple):  # Mip-Splatting returns (scales, opacities)
+        return (*value[:-1], _apply(value[-1], overrides, role))
+    if role == "gate" and overrides.gate is not None:
+        return value * overrides.gate.to(value).view(-1, *[1] * (value.dim() - 1))
+    if role == "detail" and overrides.detail is not None:
+        return value + sh0_offset(overrides.detail, value)
+    return value
 
 
 def host_output(
