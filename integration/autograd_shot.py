@@ -163,9 +163,9 @@ class AutogradShot:
         results = []
         for g in found:
             raw, self.of_others[:] = to_leaves(g, self.edges, self.params, shared=self.shared)
-            detail = g.get("detail") if g.colour is None else self._of_detail(*g.colour)
-            if "detail" in self.params and detail is not None and weight is None:
-                raw["detail"] = detail
+            if "detail" in self.params and weight is None:
+                detail = g.get("detail") if g.colour is None else self._of_detail(*g.colour)
+                raw |= {} if detail is None else {"detail": detail}
             results.append(Grads(every_number(raw, self.params), screen=g.screen))
         return results + [Grads({k: x for k, x in g.items() if k in self.params}, screen=g.screen) for g in of_hf]
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 from weakref import WeakKeyDictionary
 
@@ -81,7 +82,8 @@ def joint_loss(
             require_apart({} if lr.drawing else lr.drawn or {})
         if isinstance(hr, AutogradShot):
             require_apart(hr.drawn or {})
-            hr = at_inputs(hr, _ONCE.setdefault(conductor, Once(_log.warning)))
+            warn = _ONCE.setdefault(conductor, Once(_log.warning))
+            hr = replace(at_inputs(hr, warn), of_others=[])  # a shot may be used again
             require_in_order("hr", hr.inputs, hr.params)
         update = conductor.update(values, lr, hr, view, t)
         others = [*_others(params, lr, of_lr.leaves, update)]

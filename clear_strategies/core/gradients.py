@@ -66,8 +66,7 @@ class Grads(dict[str, Tensor]):
         """The sum with another, each of whose rows counts `weight` times."""
         total = Grads(self)
         for name, value in other.items():
-            added = scale_rows(value, weight)
-            total[name] = total[name] + added if name in total else added
+            total[name] = _plus_rows(total[name], value, weight) if name in total else scale_rows(value, weight)
         return total
 
     def __mul__(self, weight: float | Float[Tensor, " N"]) -> Grads:
@@ -147,6 +146,15 @@ class Shot(Protocol):
             weight: the last two are summed by it, see `summed`; None: nothing is. A shot of one's own may lack it.
         """
         ...
+
+
+def _plus_rows(
+    a: Float[Tensor, "N ..."], b: Float[Tensor, "N ..."], weight: float | Float[Tensor, " N"]
+) -> Float[Tensor, "N ..."]:
+    """A + weight · b, row by row."""
+    if not isinstance(weight, Tensor):
+        return torch.add(a, b, alpha=weight)
+    return torch.addcmul(a, b, weight.to(b).view(-1, *[1] * (b.dim() - 1)))
 
 
 def scale_rows(value: Float[Tensor, "N ..."], weight: float | Float[Tensor, " N"]) -> Float[Tensor, "N ..."]:

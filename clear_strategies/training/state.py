@@ -20,6 +20,7 @@ from clear_strategies.data.scene import Scene
 from clear_strategies.errors import AnswerError, DataError, DivergedError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.skips import Plateau
+from clear_strategies.signatures import signature_of
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
@@ -56,6 +57,16 @@ def fingerprints(scene: Scene) -> dict[str, Tensor]:
 
 def _means(layers: Float[Tensor, "H W C"]) -> Float[Tensor, "C h w"]:
     return adaptive_avg_pool2d(torch.nan_to_num(layers, 0.0, 0.0, 0.0).permute(2, 0, 1), _CELLS).cpu()
+
+
+def _densifier_of(owner: Strategy | DensifierSettings, *arguments: Any) -> Any:
+    """Settings of an older version, say, take other arguments."""
+    try:
+        signature_of(owner.densifier).bind(*arguments)
+    except TypeError as error:
+        rule = f"must take (field, views, seed), got {signature_of(owner.densifier)}"
+        raise AnswerError(f"{type(owner).__name__}.densifier() {rule}. See Strategy.densifier.") from error
+    return owner.densifier(*arguments)
 
 
 @dataclass(slots=True)
@@ -106,9 +117,9 @@ class TrainState:
         device = scene.device
         theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree).to(device)
         owner: Strategy | DensifierSettings | None = conductor.owner("densifier")
-        densifier: Any = None if owner is None else owner.densifier(theta, scene.train, settings.seed)
+        densifier = None if owner is None else _densifier_of(owner, theta, scene.train, settings.seed)
         if densifier is None:
-            owner, densifier = density, density.densifier(theta, scene.train, settings.seed)
+            owner, densifier = density, _densifier_of(density, theta, scene.train, settings.seed)
         if not isinstance(densifier, Densifier):
             rule = f"must give a {Densifier.__module__}.Densifier{'' if owner is density else ' or None'}"
             raise AnswerError(f"{type(owner).__name__}.densifier() {rule}, got {densifier!r:.80}.")

@@ -38,9 +38,16 @@ _POSE_RATIO: Final = 10  # by which the second nearest pose must be farther away
 
 def draws_its_arguments(rasterization: Rasterization) -> bool:
     """Return True for gsplat's function and this package's; one that calls them may also change colours, say."""
-    function = rasterization.func if isinstance(rasterization, partial) else rasterization
-    module: str = getattr(function, "__globals__", {}).get("__name__", "")  # `functools.wraps` copies `__module__`
-    return module.partition(".")[0] in ("gsplat", "rasterizers")
+    function: Any = rasterization.func if isinstance(rasterization, partial) else rasterization
+    while _defined_in(function) == "contextlib":  # gsplat 1.6's is decorated by a context that traces it
+        function = function.__wrapped__
+    return _defined_in(function) in ("gsplat", "rasterizers")
+
+
+def _defined_in(function: Any) -> str:
+    """The package whose code this is; `functools.wraps` copies `__module__`."""
+    module: str = getattr(function, "__globals__", {}).get("__name__", "")
+    return module.partition(".")[0]
 
 
 def cameras_read(call: Call) -> dict[str, Tensor]:

@@ -1,7 +1,7 @@
 """Calls of a wrapped `rasterization`: which one is the rendering of a photo, and what else a loop draws beside it."""
 
 import functools
-from contextlib import nullcontext
+from contextlib import ContextDecorator, nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -61,6 +61,9 @@ def test_hr_has_what_a_partial_presets():
 def test_a_function_that_may_draw_more_than_its_arguments_say():
     ours = rasterizers.rasterization
 
+    class Traced(ContextDecorator, nullcontext):
+        """As gsplat 1.6 decorates its function."""
+
     @functools.wraps(ours)
     def brighter(*args, **kwargs):
         image, *rest = ours(*args, **kwargs)
@@ -68,7 +71,9 @@ def test_a_function_that_may_draw_more_than_its_arguments_say():
 
     assert calls.draws_its_arguments(ours)
     assert calls.draws_its_arguments(functools.partial(ours, backend="torch"))
+    assert calls.draws_its_arguments(Traced()(ours))
     assert not calls.draws_its_arguments(brighter)
+    assert not calls.draws_its_arguments(Traced()(brighter))
 
 
 def test_a_depth_pass_is_part_of_its_step_and_colours_without_spherical_harmonics_have_the_detail_feature():

@@ -239,6 +239,11 @@ def test_the_compiled_kernels_refuse_other_images(x, y, error, message):
         image_pair(("cpu",), x, y, None)
 
 
+def test_images_on_different_devices_are_refused():
+    with pytest.raises(TypeError, match=r"y must be float32 .* where x is, got .* on meta"):
+        image_pair(("cpu", "meta"), torch.rand(4, 5, 3), torch.rand(4, 5, 3, device="meta"), None)
+
+
 def test_auto_uses_torch_for_images_that_the_compiled_kernels_refuse():
     x, y = image(6, 7, 1), image(6, 7, 2)
     assert losses.photometric(x, y, 0.2).value.dtype == torch.float64

@@ -371,6 +371,11 @@ def test_density_is_replaced_by_what_has_the_hook_of_a_strategy():
     assert type(start(density=density(Doubles)).density) is Doubles
     with pytest.raises(AnswerError, match=r"Mine.densifier\(\) must give a .*Densifier, got None"):
         start(density=density(lambda n: None))
+    old = type("Old", (), {"densifier": lambda self, n, *, extent, seed: Doubles(n)})()
+    with pytest.raises(
+        AnswerError, match=r"Old.densifier\(\) must take \(field, views, seed\), got \(n, \*, extent, seed\)"
+    ):
+        start(density=old)
 
 
 def test_a_densifier_of_ones_own_gets_the_scores_that_it_collects():
