@@ -49,7 +49,7 @@ class FinishedRun:
             metrics as "metrics.<name>"; "bicubic", "prior": PSNR of these images; conflict, gaussians, seconds. NaN: unknown.
         views: the names of the scored views. config: every setting, by its dotted key.
         job: its number in a sweep, None without one; ended: when, UTC, empty if unknown; keys: of all overrides that may change a
-            result, which the jobs of a sweep share.
+            result, but of methods and strategies, which take each other's place; the jobs of a sweep share them.
     """
 
     folder: Path
@@ -107,7 +107,9 @@ class FinishedRun:
             config=content.config,
             job=int(job[1]) if job else None,
             ended=str(content.provenance.get("date", "")),
-            keys=frozenset(given) - CHANGES_NO_RESULT,
+            keys=frozenset(key for key in given if not OF_STRATEGY.fullmatch(key))
+            - CHANGES_NO_RESULT
+            - {"method", "strategy"},
         )
 
 

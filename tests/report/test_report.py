@@ -471,6 +471,17 @@ def test_runs_of_a_sweep_are_in_the_order_of_their_jobs_and_linked_ones_count_on
     assert [run.name for run in report.collect([runs, ours, runs / ".." / "runs" / "ours"])] == ["gco", "clear"]
 
 
+def test_methods_and_strategies_of_a_sweep_are_in_the_order_of_their_jobs(tmp_path: Path) -> None:
+    """Jobs that run at once end in any order."""
+    rows = ["+strategy=gco", "+method=srgs", "+strategy=clear"]
+    for minute, number in enumerate((1, 2, 0)):
+        folder = make_run(
+            tmp_path / str(number), rows[number], provenance={"date": f"2026-11-22T10:{minute:02}:00+00:00"}
+        )
+        files.write_text(folder / ".hydra" / "hydra.yaml", f"hydra:\n  job:\n    num: {number}\n")
+    assert [run.name for run in report.collect([tmp_path])] == ["gco", "srgs", "clear"]
+
+
 def test_sweeps_in_one_folder_stand_one_after_the_other_also_one_that_was_resumed(tmp_path: Path) -> None:
     """Jobs that run at once end in any order, and names of folders say nothing of time."""
     ended = [("m_one", 1), ("z_none", 0), ("b_two", 0), ("n_three", 1), ("a_last", 2), ("o_ther", 0), ("l_resumed", 3)]
