@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies.errors import SettingError, one_line
-from clear_strategies.options import CONF, composed_by_hydra, options, sweeps
+from clear_strategies.options import CONF, composed_by_hydra, has_setting, options, sweeps
 from clear_strategies.settings import TARGET, flat, has_parameter, key_of
 
 WRITTEN: Final = "A setting is written name=value, and clear-strategies --cfg job prints all of them."
@@ -105,9 +105,10 @@ def _no_setting(key: str, overrides: Sequence[str], config: str) -> str:
     if (CONF / key).is_dir():
         return f"no choice of this group is there to be replaced, so it is added: +{key}={value or '…'}."
     others, group = [o for o in overrides if key_of(o) != key], key.partition(".")[0]
-    for choice in (group, *["+protocol"] * (group == "data")):  # a protocol's scenes have data.root
-        named = [f"{choice}={option}" for option in options(choice.lstrip("+"))]
-        if having := [word for word in named if key in flat(_composed([*others, word], config))]:
+    for choice in (group, *["protocol"] * (group == "data")):  # a protocol's scenes have data.root
+        plus = "+" * (choice == "protocol")
+        having = [f"{plus}{choice}={option}" for option in options(choice) if has_setting(choice, option, key)]
+        if having and key in flat(_composed([*others, having[0]], config)):  # else another of the group is chosen
             train = ", or let the command find it: clear-strategies train FOLDER" if key == "data.path" else ""
             return f"there is no such setting without one of {', '.join(having)}. Add it{train}."
     return f"there is no such setting. {_remedy(key, value, overrides, _composed(others, config), config)}"

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -26,7 +26,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies.errors import SettingError
-from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, defaults_of, key_of, with_defaults
+from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, defaults_of, flat, key_of, with_defaults
 
 _PACKAGE: Final = Path(__file__).resolve().parent
 # In a wheel conf/ lies inside the package, in a checkout beside it.
@@ -60,28 +60,44 @@ def composed_by_hydra(overrides: Sequence[str], config: str) -> DictConfig:
 
 def strategies_of(option: str) -> list[str]:
     """The strategies that an option of conf/strategy consists of, those of the options that it names included."""
-    _, parts = _content_and_parts("strategy", option)
+    _, parts, _ = _read_option("strategy", option)
     return [strategy for part in parts for strategy in strategies_of(part)] or [option]
 
 
 def sweeps(experiment: str) -> bool:
     """Return True if an option of conf/experiment, or one that it consists of, names settings that are swept."""
-    content, parts = _content_and_parts("experiment", experiment)
+    content, parts, _ = _read_option("experiment", experiment)
     return bool("sweeper" in content.get("hydra", {})) or any(map(sweeps, parts))
 
 
-def _content_and_parts(group: str, option: str) -> tuple[dict[str, Any], list[str]]:
-    """The content of an option's file, empty if there is none, and the options of the same group in its defaults list."""
-    file = CONF / group / f"{option}.yaml"
-    content: Any = OmegaConf.to_container(OmegaConf.load(file)) if file.is_file() else {}
+def _read_option(group: str, option: str) -> tuple[dict[str, Any], list[str], bool]:
+    """The content of an option's file, empty if there is none; the options of the same group in its defaults list; and whether
+    it has whole keys.
+    """
+    file = next((file for folder in _folders() if (file := folder / group / f"{option}.yaml").is_file()), None)
+    text = file.read_text(encoding="utf-8") if file else "{}"
+    content: Any = OmegaConf.to_container(OmegaConf.create(text))
     parts = [part for part in content.get("defaults", []) if isinstance(part, str)]
-    return content, [part for part in parts if part != "_self_" and not part.startswith("/")]
+    own = [part for part in parts if part != "_self_" and not part.startswith("/")]
+    return content, own, text.startswith("# @package _global_")
+
+
+def has_setting(group: str, option: str, key: str) -> bool:
+    """Return True if an option, or one of its group that it consists of, has a setting, as data=colmap has data.path."""
+    content, parts, is_global = _read_option(group, option)
+    own = flat(with_defaults(content), "" if is_global else f"{group}.")
+    return key in own or any(has_setting(group, part, key) for part in parts)
+
+
+def _folders() -> Iterator[Path]:
+    """conf/, and then the folders that other packages bring, which takes 25 ms to find."""
+    yield CONF
+    yield from (Path(_folder_of(point)) for point in entry_points(group=OPTIONS))
 
 
 def options(group: str) -> dict[str, Mapping[str, Any]]:
-    """The content of each file in a group of conf/ and of the folders that other packages bring, by its name."""
-    folders = (CONF, *(Path(_folder_of(point)) for point in entry_points(group=OPTIONS)))
-    files = [file for folder in folders for file in sorted((folder / group).glob("[!_]*.yaml"))]
+    """The content of each file in a group, by its name."""
+    files = [file for folder in _folders() for file in sorted((folder / group).glob("[!_]*.yaml"))]
     return {file.stem: OmegaConf.to_container(OmegaConf.load(file)) for file in files}  # type: ignore[misc]
 
 
