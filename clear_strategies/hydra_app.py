@@ -113,8 +113,9 @@ def readable(word: str) -> str:
         word = f"{key}={value}"
     try:
         chosen = OverridesParser.create().parse_override(word)
-    except HydraException:
-        return f"{key}={quoted(value)}"
+    except HydraException:  # it has no `~` in a list, either
+        each = re.sub(r"(?<=[\[, ])~[^],]*", lambda path: quoted(files.expanded(path[0])), value)
+        return f"{key}={each}" if value.startswith("[") and each != value else f"{key}={quoted(value)}"
     require_option(chosen)
     if chosen.key_or_group == "hydra.job.chdir" and chosen.value():
         raise SettingError(

@@ -217,6 +217,9 @@ def test_a_tilde_is_the_users_folder_wherever_a_setting_is_a_path(monkeypatch):
     assert values["data"]["reader"]["root"] == values["data"]["path"] == "/home/me/photos"
     assert (values["prior"]["path"], values["fit"]["resume"]) == ("/home/me/sr", "/home/me/run")
     assert values["data"]["save_lr"] == "/home/me"
+    listed = [hydra_app.readable(f"+mine={value}") for value in ("[~/photos,~,~/a b/c,d]", "[a, ~]", "['~/x']")]
+    lists = [tree(composed(word))["mine"] for word in listed]
+    assert lists == [["/home/me/photos", "/home/me", "/home/me/a b/c", "d"], ["a", "/home/me"], ["/home/me/x"]]
 
 
 def test_a_host_gets_the_strategies_the_decorators_and_the_rates_of_what_it_names():
