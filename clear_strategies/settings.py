@@ -148,7 +148,8 @@ def _called(node: Mapping[str, Any], key: str) -> Any:
     parameters, hints = _parameters(function), _hints(function)
     given = {name: value for name, value in node.items() if name not in _KEYWORDS}
     _refuse_unknown(given, parameters, key, str(target))
-    arguments, own, defaults = {}, _own_defaults(function), _defaults(function)
+    arguments, own = {}, _own_defaults(function)
+    defaults = _defaults(function, own)
     for name, value in given.items():
         if name in defaults and repr(value) == repr(defaults[name]):  # not ==: to Python true is 1
             arguments[name] = own[name]  # a text may stand for what no text becomes again, by its annotation
@@ -233,11 +234,12 @@ def _own_defaults(function: Callable[..., Any]) -> dict[str, Any]:
     }
 
 
-def _defaults(function: Callable[..., Any]) -> dict[str, Any]:
-    """The node that calls the function with all of its defaults."""
+def _defaults(function: Callable[..., Any], own: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The node that calls the function with all of its defaults, which `_own_defaults` may have made already."""
     declared = fields(function) if is_dataclass(function) else ()
     unlisted = {f.name for f in declared if not f.metadata.get(LISTED, True)}
-    plain = {name: _plain(default) for name, default in _own_defaults(function).items() if name not in unlisted}
+    own = _own_defaults(function) if own is None else own
+    plain = {name: _plain(default) for name, default in own.items() if name not in unlisted}
     return {TARGET: None, **{name: value for name, value in plain.items() if value is not _ABSENT}}
 
 

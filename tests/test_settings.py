@@ -92,6 +92,20 @@ def test_a_text_becomes_the_path_and_lists_the_tuples_that_are_asked_for():
         build(target(Listed, at=3))
 
 
+_MADE = list[object]()
+
+
+@dataclass(frozen=True)
+class Costly:
+    table: list[int] = field(default_factory=lambda: _MADE.append(object()) or [1])  # type: ignore[func-returns-value]
+
+
+def test_the_default_of_a_factory_is_made_once_to_be_compared_with_a_setting():
+    _MADE.clear()
+    assert build(target(Costly, table=[2])) == Costly([2])
+    assert len(_MADE) == 1
+
+
 class Mode(Enum):
     SOFT = "soft"
     HARD = "hard"
