@@ -106,16 +106,16 @@ class _Job:
         if resumes and (finished := resume.finished(folder, self.compared, load)) is not None:
             return finished.psnr
         require_paths(self.compared.get)
-        # In a sweep the console shows one line per job; the rest is in run.log.
-        level = logging.DEBUG if in_sweep() else logging.INFO
-        asked, source = settings.fit, settings.data.source
-        choices = plan.describe_choices(self.chosen, self.conductor, source, asked.iterations, asked.seed)
-        _log.log(level, "%s", choices)
         if settings.data.save_lr is not None:
             capture, views = scenes.read(settings.data, None)
             _warn_if_few_placed(capture.notes)
             save_lr(capture, views, Path(settings.data.save_lr))
             return None
+        # In a sweep the console shows one line per job; the rest is in run.log.
+        level = logging.DEBUG if in_sweep() else logging.INFO
+        asked, source = settings.fit, settings.data.source
+        choices = plan.describe_choices(self.chosen, self.conductor, source, asked.iterations, asked.seed)
+        _log.log(level, "%s", choices)
         found = resume.found(settings.fit.resume, folder, self.compared)
         scene = load()
         _warn_if_few_placed(scene.notes)
