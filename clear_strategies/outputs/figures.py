@@ -106,7 +106,7 @@ def write_curves(path: Path, histories: Mapping[str, pd.DataFrame], title: str) 
                 (known[run],) = axis.plot(points[over], y, **style)
         if column == "loss_lr" and math.isfinite(axis.dataLim.minposy):  # a value is positive
             axis.set_yscale("log")  # after a reset of the opacities the loss is a hundred times as large
-        _finish(axis)
+        _finish(axis, column)
     if known:
         names = [textwrap.fill(run, width=60) for run in known]
         legend = figure.legend(
@@ -119,8 +119,8 @@ def write_curves(path: Path, histories: Mapping[str, pd.DataFrame], title: str) 
     save(figure, path)
 
 
-def _finish(axis: Any) -> None:
-    """Style the axes; those without data are labelled "not measured"."""
+def _finish(axis: Any, column: str) -> None:
+    """Style the axes; those without data say which column of history.csv is empty."""
     axis.title.set(fontsize=10, color=INK)
     axis.tick_params(which="both", labelsize=8, colors=FAINT)
     axis.spines[["top", "right"]].set_visible(False)
@@ -129,7 +129,8 @@ def _finish(axis: Any) -> None:
         axis.set_xlim(left=0)
         axis.grid(alpha=0.25, linewidth=0.5)
     else:
-        axis.text(0.5, 0.5, "not measured", fontsize=9, color=FAINT, ha="center", transform=axis.transAxes)
+        text = f"not measured: nothing has logged {column}"
+        axis.text(0.5, 0.5, text, fontsize=9, color=FAINT, ha="center", transform=axis.transAxes)
         axis.set(xticks=[], yticks=[])
 
 

@@ -151,6 +151,13 @@ def test_runs_without_history_are_not_drawn_and_dollars_are_no_mathematics(tmp_p
     assert not np.array_equal(nine, none)
 
 
+def test_a_chart_without_data_says_what_no_strategy_has_logged(tmp_path, monkeypatch):
+    said: list[str] = []
+    monkeypatch.setattr(Axes, "text", lambda axis, x, y, text, **style: said.append(text))
+    write_curves(tmp_path / "c.png", {"mine": history(loss_lr=1.0, psnr_test=20.0, conflict=0.1, n_gaussians=9.0)}, "")
+    assert said == ["not measured: nothing has logged corrected"]
+
+
 def test_the_curves_mark_the_iterations_that_reset_opacities(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     marked: list[float] = []
     monkeypatch.setattr(Axes, "axvline", lambda axis, x, **style: marked.append(x) or Line2D([], []))
