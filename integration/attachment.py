@@ -161,6 +161,7 @@ class Attachment:
             self._follow_structure(len(self._host.leaves()["means"]))  # the host may have densified since it rendered
         return {
             "t": self.t, "passes": self.passes, "passes_with_hr": self._merging.fading.passes,
+            "by_hand": self._steps.by_hand,
             "strategies": self.conductor.state_dict(),
             "view": None if self._step is None else self._step.view.name, "step": _rows_of(self._step),
             "score": None if self._merging.scaler is None else self._merging.scaler.state_dict(),
@@ -169,6 +170,7 @@ class Attachment:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a state, after the host has loaded its parameters."""
         self.t, self.passes = int(state["t"]), int(state["passes"])
+        self._steps.by_hand = state.get("by_hand", 0)
         self.conductor.load_state_dict(state["strategies"])
         self._host.restart_parents()
         leaves = self._host.leaves()
@@ -289,7 +291,7 @@ class Attachment:
         Args:
             before: `.grad` before the pass, by name.
         """
-        self._steps.on_merge()
+        self._steps.on_merge(first=conflict is not None)
         if conflict is None:
             return
         self._dropped = self.passes > 0 and not any(bool(g.any()) for name, g in before.items() if name != "detail")

@@ -23,7 +23,7 @@ from clear_strategies.errors import HostError
 
 _log = logging.getLogger(__name__)
 
-_OF_SAM: Final = 2  # merges over a view before the first step, by which steps by hand are told from those of SAM
+_OF_SAM: Final = 2  # renderings of a view before the first step, by which steps by hand are told from those of SAM
 _PATIENCE: Final = 10  # iterations with extra views, one after the other, of which none made a step, before a warning
 
 
@@ -35,6 +35,9 @@ class HostSteps:
         begins: called when a step of the host begins, with whether gradients have been merged since the last step.
         after: called after an optimizer has stepped, also on extra views.
         counts: `Attachment.counts`, to which this class adds.
+
+    Attributes:
+        by_hand: renderings that were merged before the first step; None: an optimizer has stepped.
     """
 
     def __init__(
@@ -45,7 +48,7 @@ class HostSteps:
         self._hooked: list[torch.optim.Optimizer] = []
         self._stepped: set[torch.optim.Optimizer] = set()  # in this step of the host
         self._has_merged = False  # since the last step
-        self._by_hand: int | None = 0  # merges before the first step; None: an optimizer has stepped
+        self.by_hand: int | None = 0
         self._extra: list[Grads] = []
         self._rendered: Mapping[str, Tensor] = {}  # the leaves of `_extra`
         self._steps_on_extra = False  # an optimizer is stepping on an extra view
@@ -69,19 +72,21 @@ class HostSteps:
             *(o.register_step_post_hook(lambda o, *_: self._after_one(o)) for o in distinct),
         ]  # fmt: skip
 
-    def on_merge(self) -> None:
-        """Called when gradients were merged: the next step of any optimizer begins a step of the host."""
+    def on_merge(self, *, first: bool) -> None:
+        """Called when gradients were merged, the first of a rendering or more of it: the next step of any optimizer begins a step
+        of the host.
+        """
         self._stepped.clear()
         self._has_merged = True
-        if self._by_hand is not None:
-            self._by_hand += 1
+        if self.by_hand is not None:
+            self.by_hand += first
 
     @property
     def are_known(self) -> bool:
         """True if the host has optimizers whose steps can be seen. A loop that steps by hand has none but that of f_det, which it
         does not step.
         """
-        return bool(self._hooked) and (self._by_hand is None or self._by_hand < _OF_SAM)
+        return bool(self._hooked) and (self.by_hand is None or self.by_hand < _OF_SAM)
 
     @property
     def has_extra_views(self) -> bool:
@@ -136,7 +141,7 @@ class HostSteps:
         self._before()
         if optimizer in self._stepped or self._stepped.isdisjoint(self._hooked):  # all may have been made anew
             self._stepped.clear()
-        begins, self._by_hand = not self._stepped, None
+        begins, self.by_hand = not self._stepped, None
         self._stepped.add(optimizer)
         if begins:
             has_merged, self._has_merged = self._has_merged, False

@@ -436,14 +436,33 @@ def test_a_step_of_sam_is_one_iteration_and_one_of_summed_views_is_several():
 @pytest.mark.parametrize("optimizers", [True, False])
 def test_a_loop_that_steps_by_hand_over_one_view_goes_on(optimizers):
     """The first pass alone may be that of SAM, whose step is still to come."""
-    host = Host(toy.scene(20))
-    host.optimizers = host.optimizers if optimizers else {}
-    host, clear, render = started(host=host)
-    for _ in range(6):
+
+    def begun():
+        host = Host(toy.scene(20))
+        host.optimizers = host.optimizers if optimizers else {}
+        return started(host=host)
+
+    host, clear, render = begun()
+    for i in range(6):
+        if i == 3:  # resumed
+            state = clear.attachment.state_dict()
+            host, clear, render = begun()
+            clear.attachment.load_state_dict(state)
         render().mean().backward()
         for name, p in host.splats.items():
             p.grad = p.grad if name == "detail" else None
     assert clear.attachment.t == 5
+
+
+def test_a_step_of_sam_whose_passes_reach_each_parameter_apart_is_one_iteration():
+    host, clear, render = started(conductor=Conductor(objective=HR_FROM_START))
+    for _ in range(2):
+        loss = render(0).mean()
+        loss.backward(inputs=[host.splats["means"]], retain_graph=True)
+        loss.backward(inputs=[host.splats["scales"], host.splats["opacities"]])
+        for name, p in host.splats.items():
+            p.grad = p.grad if name == "detail" else None
+    assert clear.attachment.t == 1
 
 
 def test_a_gradient_penalty_from_the_merged_gradient_is_told_once_to_have_no_effect(caplog):
