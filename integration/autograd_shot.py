@@ -31,7 +31,7 @@ from integration.graph import (
 )
 from rasterizers.differentiable import Drawing, outer
 from rasterizers.interface import Camera, summed_vjp
-from rasterizers.torch_internals import is_hooked, version
+from rasterizers.torch_internals import is_hooked, of_gradient, version
 
 OfOthers = list[tuple[Tensor, Tensor]]
 """Other leaves that the loop trains (of a network, an embedding), each with its gradient."""
@@ -329,10 +329,10 @@ def to_leaves(
     leaves = [*raw.values(), *others]
     if not graph or not leaves:
         return Grads(direct, colour=colour), []
-    at_drawn = [g[name] if scale == 1 else g[name] * scale for name in graph]
-    through = torch.autograd.grad(
-        [*map(edge_of, graph.values())], leaves, at_drawn, retain_graph=True, allow_unused=True
-    )
+    edges = [*map(edge_of, graph.values())]
+    at_drawn = [g[name].view(of_gradient(edge)[0]) for name, edge in zip(graph, edges, strict=True)]  # some [1, N, …]
+    at_drawn = at_drawn if scale == 1 else [x * scale for x in at_drawn]
+    through = torch.autograd.grad(edges, leaves, at_drawn, retain_graph=True, allow_unused=True)
     values = [x if x is None or scale == 1 else x / scale for x in through]
     found = {name: x for name, x in zip(raw, values, strict=False) if x is not None}
     both = {name: direct[name] + found[name] for name in direct.keys() & found.keys()}

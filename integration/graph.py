@@ -85,20 +85,23 @@ class Inputs(NamedTuple):
         nodes: of the rasterizer, one for each of its calls.
         edges: where the gradients of its inputs with a row for each Gaussian go, by name.
         shared: leaves behind these that reach the image beside the rasterizer, too, of whose gradients the edges bring a part.
+        by_camera: names of those whose gradients are [1, N, …].
     """
 
     nodes: Collection[Any]
     edges: Mapping[str, GradientEdge]
     shared: Sequence[Tensor] = ()
+    by_camera: Collection[str] = ()
 
     @contextmanager
     def collected(self) -> Iterator[dict[str, Tensor]]:
-        """The gradients of the edges by name, of the one backward pass in this context."""
+        """The gradients of the edges by name, [N, …], of the one backward pass in this context."""
         found: dict[str, Tensor] = {}
 
         def keep(i: int, of_inputs: Sequence[Tensor | None]) -> None:
             of_node = {_name(i, j): g for j, g in enumerate(of_inputs)}
-            found.update({name: g for name, g in of_node.items() if g is not None and name in self.edges})
+            of_edges = {name: g for name, g in of_node.items() if g is not None and name in self.edges}
+            found.update({name: g[0] if name in self.by_camera else g for name, g in of_edges.items()})
 
         with ExitStack() as hooks:
             for i, node in enumerate(self.nodes):
@@ -163,7 +166,9 @@ def inputs_of(
     }
     graphs = {name: graph_of(edge) for name, edge in inputs.items()}
     of_own = {name for name, found in graphs.items() if found.reaches(own)}
-    has_rows = {name for name, edge in inputs.items() if of_gradient(edge)[0][:1] == (n,)}
+    shapes = {name: of_gradient(edge)[0] for name, edge in inputs.items()}
+    by_camera = {name for name, shape in shapes.items() if shape[:2] == (1, n) and n > 1}
+    has_rows = by_camera | {name for name, shape in shapes.items() if shape[:1] == (n,)}
     if of_own - has_rows or any(not found.nodes.isdisjoint(nodes) for found in graphs.values()):
         return None
     edges = {name: inputs[name] for name in has_rows if name in of_own or graphs[name].reaches(others)}
@@ -172,7 +177,7 @@ def inputs_of(
     near_first = sorted(of_own, key=lambda name: len(graphs[name].nodes))  # a network may lie between the others
     pairs = [(inputs[name], p) for name in near_first for p in own if graphs[name].reaches([p])]
     is_drawn = any(edge == edge_of(p) for edge, p in pairs)  # without waits of the test for the device
-    return Inputs(nodes, edges, shared) if is_drawn or (pairs and _are_in_order(pairs)) else None
+    return Inputs(nodes, edges, shared, by_camera) if is_drawn or (pairs and _are_in_order(pairs)) else None
 
 
 def reaching(drawn: Mapping[str, Tensor]) -> tuple[str, str] | None:
@@ -241,11 +246,12 @@ def _are_in_order(pairs: Iterable[tuple[Edge, Tensor]]) -> bool:
 def _is_in_order(x: Edge, p: Tensor) -> bool | None:
     """None: x does not depend on p."""
     shape, dtype = of_gradient(edge := edge_of(x))
-    code = 1 + (torch.arange(shape[0], device=p.device, dtype=torch.float64) * _GOLDEN).frac().to(dtype)
+    columns = len(shape) - 1 - (shape[0] != len(p))  # behind the rows, of one camera
+    code = 1 + (torch.arange(len(p), device=p.device, dtype=torch.float64) * _GOLDEN).frac().to(dtype)
     with without_hooks([p]):
         plain, coded = (
             torch.autograd.grad([edge], p, [c], retain_graph=True, allow_unused=True)[0]
-            for c in (code.new_ones(shape), code.view(-1, *[1] * (len(shape) - 1)).expand(shape))
+            for c in (code.new_ones(shape), code.view(-1, *[1] * columns).expand(shape))
         )
     if plain is None or not bool(plain.any()):
         return None

@@ -8,11 +8,13 @@ import pytest
 import torch
 
 from clear_strategies import GCO, P2G, SVS, Conductor, Strategy
+from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.core.step import Step
 from clear_strategies.training.field import GaussianField
 from integration import AutogradShot, HostError, ScoreScaler, extra_loss, graph, joint_loss
 from integration.autograd_shot import ScreenGradientSlot
 from rasterizers import autograd
+from rasterizers.geometry import SH_C0
 from tests.helpers import toy
 from tests.helpers.command_line import started
 from tests.helpers.host_parts import HR_FROM_START, shot_of
@@ -142,10 +144,26 @@ class Halved(Strategy):
         return found
 
 
+class OfCameras(torch.autograd.Function):
+    """One node that draws by a function of its inputs, which have a first dimension of cameras, as those of gsplat's node."""
+
+    @staticmethod
+    def forward(ctx, draw, *inputs):
+        ctx.inputs = [x[0].detach().requires_grad_() for x in inputs]
+        with torch.enable_grad():
+            ctx.image = draw(*ctx.inputs)
+        return ctx.image.detach()
+
+    @staticmethod
+    def backward(ctx, g):
+        return None, *(x[None] for x in torch.autograd.grad(ctx.image, ctx.inputs, g, retain_graph=True))
+
+
 @pytest.mark.parametrize("share", [1.0, 0.5])
 @pytest.mark.parametrize("strategies", [(GCO(),), (GCO(), P2G(patch=4))], ids=len)
 @pytest.mark.parametrize("hooked", [False, True])
-def test_what_else_the_loop_trains_gets_its_gradient(share, strategies, hooked):
+@pytest.mark.parametrize("by_camera", [False, True])
+def test_what_else_the_loop_trains_gets_its_gradient(share, strategies, hooked, by_camera):
     """The exposure, which is applied after drawing, that of LR; an offset of what is drawn also that of HR after routing."""
     scene, comparing = toy.scene(20), [Halved()] * (share < 1)
     host, view, conductor = Host(scene), scene.train[0], Conductor(*strategies, *comparing, objective=HR_FROM_START)
@@ -157,6 +175,15 @@ def test_what_else_the_loop_trains_gets_its_gradient(share, strategies, hooked):
         if hooked:
             sh0.register_hook(lambda g: 3 * g)
         shot = host.draw(camera, detail, sh0=sh0)
+        if by_camera:
+            named = host.activated(sh0=sh0 if detail is None else sh0 + detail[:, None] / SH_C0)
+            inputs = {name: named[name][None] for name in PARAMETERS}
+            centres = (host.params["means"][:, :2] * 1)[None]
+            image = OfCameras.apply(
+                lambda means2d, *x: host.draw(camera, None, means2d, **dict(zip(inputs, x, strict=True))).image,
+                centres, *inputs.values(),
+            )  # fmt: skip
+            shot = replace(shot, image=image, slot=ScreenGradientSlot(centres, (camera.width, camera.height)))
         return replace(shot, image=shot.image @ exposure)
 
     lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
