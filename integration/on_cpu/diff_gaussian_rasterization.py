@@ -189,12 +189,17 @@ class GaussianRasterizer(torch.nn.Module):
         image, alpha = view.picture(parts, centres, None, absgrad)
         image = image.permute(2, 0, 1).contiguous()
         radii = _radii(drawn, inputs, camera, rasterizer, kernel)
+        names, kinds = self._names, cast(Sequence[str], ())
+        star = next((i for i, name in enumerate(names) if name.startswith("*")), len(names))
         if s.confidence is not None:
-            kinds: Sequence[str] = ("depth", "alpha")
+            kinds = ("depth", "alpha")
         elif s.antialiasing is not None:
             kinds = ("inverse",)
-        else:
-            kinds = [kind for kind in map(_kind, self._names[2:]) if kind] if s.kernel_size is None else ()
+        elif s.kernel_size is None:  # a star may stand for the image and the radii
+            kinds = [*map(_kind, (*names[2:star], *(name for name in names[star + 1 :] if "radii" not in name)))]
+        fits = len(names) == 2 + len(kinds) if star == len(names) else len(names) <= 3 + len(kinds)
+        if names and ("" in kinds or not fits):
+            raise OwnRasterizerError(f"what it returns ({', '.join(names)})")
 
         def drawn_as(kind: str) -> Tensor:
             if kind == "alpha":
@@ -202,10 +207,7 @@ class GaussianRasterizer(torch.nn.Module):
             z = depths(means3D, pose.to(means3D))[:, None].clamp_min(_NEAR)
             return _sum(rasterizer, camera, inputs, 1 / z if kind == "inverse" else z)
 
-        returned = image, radii, *map(drawn_as, kinds)
-        if self._names and len(self._names) != len(returned):
-            raise OwnRasterizerError(f"what it returns ({', '.join(self._names)})")
-        return returned
+        return image, radii, *map(drawn_as, kinds)
 
 
 def _kind(name: str) -> str:
@@ -217,13 +219,13 @@ def _kind(name: str) -> str:
 
 @functools.cache
 def _unpacked(code: CodeType, instruction: int) -> Sequence[str]:
-    """The names to which this call unpacks its result; none: it does not, or one has a star."""
+    """The names to which this call unpacks its result, one perhaps with a star; none: it does not."""
     here = next(islice(code.co_positions(), instruction // 2, None))
     for node in ast.walk(ast.parse("".join(linecache.getlines(code.co_filename)))):
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple):
             call, parts = node.value, node.targets[0].elts
             if here == (call.lineno, call.end_lineno, call.col_offset, call.end_col_offset):
-                return () if any(isinstance(part, ast.Starred) for part in parts) else [*map(ast.unparse, parts)]
+                return [*map(ast.unparse, parts)]
     return ()
 
 
