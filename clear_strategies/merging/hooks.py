@@ -240,7 +240,7 @@ class Hooks:
             g_lr, g_hr = both()
             # By attributes of g_HR; those that the answer leaves out are 0.
             return rows_like(s, "correct", s.correct(g_lr, g_hr, step), g_hr, "of g_HR", finite=finite)
-        weights, (n, groups) = s.reconcile(products, step), products.dot.shape
+        weights, (n, groups), at = s.reconcile(products, step), products.dot.shape, products.dot.device
         if not isinstance(weights, Weights):
             refuse(s, "reconcile", "Weights(keep, remove)", weights)
         for name, w in weights._asdict().items():
@@ -248,6 +248,9 @@ class Hooks:
                 by_group = "; w.expand_as(products.dot) gives each Gaussian those of its groups" * is_real(w, (groups,))
                 rule = f"Weights whose {name} is a number or a tensor [{n}] or [{n}, {groups}]{by_group}"
                 refuse(s, "reconcile", rule, w)
+            if isinstance(w, Tensor) and w.device != at:
+                rule = f"Weights whose {name} is on {at}, as products.dot, not on {w.device}"
+                refuse(s, "reconcile", f"{rule}; {name}.to(products.dot.device) is there", w)
         if finite:
             require_finite(s, "reconcile", weights._asdict())
         return weights

@@ -89,8 +89,9 @@ def rows_like(
     for name, x in answer.items():
         if name not in like:
             refuse(s, hook, f"attributes {whose}, {', '.join(like)}", name)
-        if not is_real(x, like[name].shape) or (x.is_meta and not like[name].is_meta):
-            refuse(s, hook, f"{name} as a tensor {[*like[name].shape]}", x)
+        shape, at = like[name].shape, like[name].device
+        if not (fits := is_real(x, shape)) or x.device != at:
+            refuse(s, hook, f"{name} as a tensor {[*shape]}" + f" on {at}, not on {x.device}" * fits, x)
     g = Grads({name: x.double() if like[name].dtype == torch.float64 else x.float() for name, x in answer.items()})
     if finite:
         require_finite(s, hook, g)

@@ -221,7 +221,16 @@ ANSWERS = {
     "keep, sparse": (
         "reconcile", lambda p, step: Weights(keep=p.dot.to_sparse()), "keep is a number or .*, got a tensor .* to_dense"
     ),
-    "regularize, meta": ("regularize", lambda p, t: {"means": p["means"].to("meta")}, "must give means as .*, got a meta tensor"),
+    "keep, meta": (
+        "reconcile", lambda p, step: Weights(keep=p.dot[:, 0].to("meta")),
+        "Weights whose keep is on cpu, as products.dot, not on meta; keep.to\\(.*\\) is there, got a meta tensor \\[30\\]",
+    ),
+    "keep, a number on another device": (
+        "reconcile", lambda p, step: Weights(keep=torch.ones((), device="meta")), "Weights whose keep is on cpu"
+    ),
+    "regularize, meta": (
+        "regularize", lambda p, t: {"means": p["means"].to("meta")}, "must give means as .* on cpu, not on meta, got a meta"
+    ),
     "route NaN": ("route", float("nan"), "must give finite numbers, but m is nan"),
     "correct": ("correct", None, "must give Grads, or a mapping from attributes to tensors, got None"),
     "correct, names": ("correct", lambda lr, hr, step: {"mean": hr["means"]}, "must give attributes of g_HR, .*, got 'mean'"),
