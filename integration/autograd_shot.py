@@ -233,13 +233,19 @@ def of_whole_image(shot: AutogradShot) -> AutogradShot:
     image was changed in place, which left no picture to take cotangents of; and without `drawn`, if one of them is computed from
     another, whose ways only a single drawing tells apart.
     """
+    return _whole(shot)[0]
+
+
+def _whole(shot: AutogradShot) -> tuple[AutogradShot, Graph | None]:
+    """`of_whole_image`, and the graph beside what is drawn if it was walked."""
     own, drawing, has_drawings = trained(shot.params).values(), shot.drawing, bool(shot.drawings)
     if drawing and (version(drawing.image) or graph_of(shot.image, before=[drawing.image.grad_fn]).reaches(own)):
         shot = replace(shot, drawings=())
     if shot.drawing or shot.drawn is None:
-        return shot
-    is_part = _beside(shot).reaches(own) or (has_drawings and reaching(shot.drawn))
-    return replace(shot, drawn=None) if is_part else shot
+        return shot, None
+    around = _beside(shot)
+    is_part = around.reaches(own) or (has_drawings and reaching(shot.drawn))
+    return (replace(shot, drawn=None), None) if is_part else (shot, around)
 
 
 def _beside(shot: AutogradShot) -> Graph:
@@ -255,9 +261,10 @@ def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
     Args:
         warn: called if the inputs are not found, with a message and its values.
     """
-    if (shot := of_whole_image(shot)).drawing is not None:
+    shot, walked = _whole(shot)
+    if shot.drawing is not None:
         return shot
-    around, centres = _beside(shot), shot.gradient_slot.tensor
+    around, centres = walked or _beside(shot), shot.gradient_slot.tensor
     known = {*map(id, shot.params.values())}
     for edge, tensor in ((centres, centres), *centres_drawn(around)):
         known |= {*map(id, copied_to(edge, tensor, shot.params["means"]))}

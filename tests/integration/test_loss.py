@@ -11,7 +11,7 @@ from clear_strategies import GCO, P2G, SVS, Conductor, Strategy
 from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.core.step import Step
 from clear_strategies.training.field import GaussianField
-from integration import AutogradShot, HostError, ScoreScaler, extra_loss, graph, joint_loss
+from integration import AutogradShot, HostError, ScoreScaler, autograd_shot, extra_loss, graph, joint_loss
 from integration.autograd_shot import ScreenGradientSlot
 from rasterizers import autograd
 from rasterizers.geometry import SH_C0
@@ -310,6 +310,17 @@ def test_a_tensor_that_reaches_the_rasterizer_and_its_image_learns_from_lr_alone
     (of_both,) = gradients(conductor.objective, lr, hr, view, network)
     torch.testing.assert_close(network.grad, of_both)  # what is not shared
     assert "learn from LR alone" in caplog.text
+
+
+def test_the_graph_beside_what_is_drawn_is_walked_once(monkeypatch):
+    host, _, view, *_ = drawn()
+    named, beside, walks = host.activated(), autograd_shot._beside, []
+    shot = replace(host.draw(view.lr.camera, **named), drawn={name: named[name] for name in PARAMETERS})
+    monkeypatch.setattr(autograd_shot, "_beside", lambda shot: walks.append(1) or beside(shot))
+    assert autograd_shot.at_inputs(shot, print).drawn == shot.drawn
+    assert len(walks) == 1
+    in_part = autograd_shot.at_inputs(replace(shot, drawn={"means": named["means"]}), print)
+    assert (in_part.drawn, len(walks)) == (None, 3)
 
 
 def test_what_a_host_copies_for_the_screen_gradient_is_told_without_a_wait_for_the_device(monkeypatch):
