@@ -15,13 +15,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.checks import refuse, require_whole
-from clear_strategies.core.finite import is_finite
 from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.priors.interface import super_resolved
 from clear_strategies.data.view_names import write_pngs
 from clear_strategies.errors import DataError, HostError
 from clear_strategies.geometry import stereo
+from clear_strategies.geometry.photos import camera_of, image_of, require_range, require_shape
 from clear_strategies.geometry.projection import intrinsics
 from rasterizers.interface import Camera
 from rasterizers.modes import on_cpu_by_default
@@ -60,40 +60,18 @@ class HostPhoto:
     mask: Float[Tensor, "h w"] | None = None
 
     def __post_init__(self) -> None:
-        shape, K, pose = (tuple(x.shape) for x in (self.image, self.K, self.world_to_camera))
-        if len(shape) != 3 or shape[-1] not in (3, 4):
-            raise DataError(self.name, "image", f"must have shape [h, w, 3], got {shape}", "put the RGB channels last")
-        if K != (3, 3):
-            raise DataError(
-                self.name, "K", f"must have shape [3, 3], got {K}", "give the camera matrix of this photo alone"
-            )
-        if pose != (4, 4):
-            remedy = "add the last row 0 0 0 1 to rotation and translation"
-            raise DataError(self.name, "world_to_camera", f"must have shape [4, 4], got {pose}", remedy)
-        try:
-            _ = self.camera
-        except ValueError as error:
-            raise DataError(self.name, "camera", str(error), "give OpenCV's world-to-camera and K in pixels") from error
-        if self.image.dtype != torch.uint8:
-            _require_range(self.name, "image", self.image)
-        if self.mask is not None:
-            if self.mask.shape != shape[:2]:
-                problem = f"must have shape {shape[:2]}, got {tuple(self.mask.shape)}"
-                raise DataError(self.name, "mask", problem, "give [h, w] of its photo")
-            _require_range(self.name, "mask", self.mask)
-
-    @property
-    def camera(self) -> Camera:
-        """The camera at the size of the image, on the CPU, where cameras stay, see `Photo.to`."""
-        h, w = self.image.shape[:2]
-        (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
-        return Camera(self.world_to_camera.detach().float().cpu(), fx, fy, cx, cy, w, h)
+        _ = self.posed
 
     @property
     def posed(self) -> Photo:
-        """The photo with its camera, RGB in [0, 1]."""
-        image = self.image.float() / 255 if self.image.dtype == torch.uint8 else self.image.float()
-        return Photo(self.camera, image[..., :3].clamp(0, 1))  # reduced photos may overshoot
+        """The photo with its camera, RGB in [0, 1]; the mask stays apart."""
+        image = image_of(self.name, "image", self.image, alpha=True, overshoot=_OVERSHOOT)
+        pose = "world_to_camera", self.world_to_camera.float()
+        camera = camera_of(self.name, pose, ("K", self.K), image)
+        if self.mask is not None:
+            require_shape(self.name, "mask", self.mask, image.shape[:2], "give [h, w] of its photo")
+            require_range(self.name, "mask", self.mask, overshoot=_OVERSHOOT)
+        return Photo(camera, image.clamp(0, 1))  # reduced photos may overshoot
 
     @on_cpu_by_default
     def view(self, sr: SuperResolve, factor: int) -> View:
@@ -102,7 +80,7 @@ class HostPhoto:
         image, camera = lr.image, lr.camera
         result = super_resolved(sr, self.name, image.cpu(), factor)
         sr_image = result.image.to(image)
-        _require_range(self.name, "SR image", sr_image)
+        require_range(self.name, "SR image", sr_image, overshoot=_OVERSHOOT)
         sr_image = sr_image.clamp(0, 1)
         mask = None if self.mask is None else self.mask.to(image)
         if mask is not None:
@@ -160,16 +138,6 @@ def _tensor(name: str, field: str, value: object) -> Tensor:
             name, field, f"must be a tensor or an array of numbers, got a {type(value).__name__}", "give one"
         )
     return torch.tensor(np.ascontiguousarray(array))
-
-
-def _require_range(name: str, what: str, values: Tensor) -> None:
-    if not is_finite(values):
-        bad = int((~torch.isfinite(values)).sum())
-        raise DataError(name, what, f"has {bad:,} numbers that are not finite", "give numbers in [0, 1]")
-    low, high = float(values.min()), float(values.max())
-    if not (low >= -_OVERSHOOT and high <= 1 + _OVERSHOOT):
-        problem = f"must lie in [0, 1], has values from {low:.3g} to {high:.3g}"
-        raise DataError(name, what, problem, "divide 8-bit values by 255")
 
 
 def require_unique(names: Iterable[str]) -> None:

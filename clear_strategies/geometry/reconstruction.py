@@ -16,10 +16,9 @@ from clear_strategies.errors import DataError
 from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from clear_strategies.geometry.photos import blackened
+from clear_strategies.geometry.photos import blackened, camera_of, image_of, require_shape
 from clear_strategies.geometry.projection import seen_pixels
 from clear_strategies.geometry.sift import features_of
-from rasterizers.interface import Camera
 from rasterizers.modes import on_cpu_by_default
 
 
@@ -104,35 +103,20 @@ def _photos(
     _require(
         count >= 2, "images", f"must be at least 2 photos, got {count}", "depth needs a second photo of the surfaces"
     )
-    for name, tensor, shape in (("world_to_camera", poses, (count, 4, 4)), ("Ks", Ks, (count, 3, 3))):
-        found = f"must have shape {shape} for {count} photos, got {tuple(tensor.shape)}"
-        _require(tuple(tensor.shape) == shape, name, found, "stack one per photo")
+    require_shape("stereo", "world_to_camera", poses, (count, 4, 4), "stack one per photo")
+    require_shape("stereo", "Ks", Ks, (count, 3, 3), "stack one per photo")
     masks = [None] * count if masks is None else masks
     found = f"must be one for each of {count} photos, got {len(masks)}"
     _require(len(masks) == count, "masks", found, "give None where none hides")
-    poses, Ks, photos = poses.detach().cpu(), Ks.detach().cpu().double(), []
-    for i, (image, mask) in enumerate(zip(images, masks, strict=True)):
-        color = _image(f"images[{i}]", image)
+    photos = []
+    for i, (image, pose, K, mask) in enumerate(zip(images, poses.cpu(), Ks.cpu(), masks, strict=True)):
+        color = image_of("stereo", f"images[{i}]", image).to(images[0].device)
+        camera = camera_of("stereo", (f"world_to_camera[{i}]", pose), (f"Ks[{i}]", K), color)
         if mask is not None:
-            found = f"must have shape {tuple(color.shape[:2])}, got {tuple(mask.shape)}"
-            _require(mask.shape == color.shape[:2], f"masks[{i}]", found, "give [h, w] of the photo")
-        shown = None if mask is None else mask.detach().to(images[0].device) > 0
-        photos.append(blackened(Photo(_camera(i, poses[i], Ks[i], color), color.to(images[0].device), shown)))
+            require_shape("stereo", f"masks[{i}]", mask, color.shape[:2], "give [h, w] of the photo")
+        shown = None if mask is None else mask.detach().to(color.device) > 0
+        photos.append(blackened(Photo(camera, color, shown)))
     return photos
-
-
-def _image(name: str, image: Tensor) -> Float[Tensor, "h w 3"]:
-    rgb = image.ndim == 3 and image.shape[-1] == 3 and image.numel() > 0
-    remedy = "put the RGB channels last, without alpha"
-    _require(rgb, name, f"must have shape [h, w, 3], got {tuple(image.shape)}", remedy)
-    if image.dtype == torch.uint8:
-        return image.detach().float() / 255
-    found = f"must be uint8 or floating point, got {image.dtype}"
-    _require(image.is_floating_point(), name, found, "give uint8 in 0…255, or float in [0, 1]")
-    low, high = (float(x) for x in image.detach().aminmax())
-    found = f"must lie in [0, 1], spans [{low:g}, {high:g}]"
-    _require(0 <= low <= high <= 1, name, found, "divide 8-bit values by 255, or clamp")  # not for nan
-    return image.detach().float()
 
 
 def _unhidden(points: Float[Tensor, "N 3"], photos: Sequence[Photo]) -> Bool[Tensor, " N"]:
@@ -144,17 +128,6 @@ def _unhidden(points: Float[Tensor, "N 3"], photos: Sequence[Photo]) -> Bool[Ten
         shown[inside] |= visible
         hidden[inside] |= ~visible
     return shown | ~hidden
-
-
-def _camera(i: int, pose: Tensor, K: Tensor, image: Tensor) -> Camera:
-    (fx, skew, cx), (below, fy, cy), last = K.tolist()
-    found = f"must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}"
-    _require(skew == below == 0 and last == [0, 0, 1], f"Ks[{i}]", found, "rectify the photo")
-    try:
-        return Camera(pose, fx, fy, cx, cy, image.shape[1], image.shape[0])
-    except ValueError as error:
-        remedy = "give rigid world-to-camera transforms, and Ks in pixels"
-        raise DataError("stereo", f"camera {i}", str(error), remedy) from error
 
 
 def _features(means: Tensor, colors: Tensor) -> PointCloud:

@@ -74,20 +74,21 @@ POSE = PHOTO.camera.world_to_camera
 MISFITS = {
     "a 3x3 pose": (
         {"world_to_camera": POSE[:3, :3]},
-        r"world_to_camera: must have shape \[4, 4\], got \(3, 3\): add the last row",
+        r"world_to_camera: must have shape \[4, 4\], got \[3, 3\]: add the last row",
     ),
-    "a 3x4 pose": ({"world_to_camera": POSE[:3]}, r"world_to_camera: must have shape \[4, 4\], got \(3, 4\)"),
-    "a pose with scale": ({"world_to_camera": POSE * 2}, r"photo: camera: world_to_camera must be a rotation"),
-    "no focal length": ({"K": torch.zeros(3, 3)}, r"photo: camera: focal lengths and image sizes must be positive"),
+    "a 3x4 pose": ({"world_to_camera": POSE[:3]}, r"world_to_camera: must have shape \[4, 4\], got \[3, 4\]"),
+    "a pose with scale": ({"world_to_camera": POSE * 2}, r"photo: world_to_camera and K: world_to_camera must be a rotation"),
+    "no focal length": ({"K": torch.diag(torch.tensor([0.0, 0, 1]))}, r"and K: focal lengths and image sizes must be positive"),
     "a path": ({"image": "a.png"}, r"photo: image: must be a tensor or an array of numbers, got a str"),
     "no pose": ({"world_to_camera": None}, r"world_to_camera: must be a tensor or an array of numbers, got a NoneType"),
     "levels": ({"image": 255 * PHOTO.image}, r"image: must lie in \[0, 1\]"),
     "NaN": ({"image": PHOTO.image / 0}, r"image: has 1,152 numbers that are not finite"),
     "half a factor": ({"factor": 2.5}, "factor: must be a whole number of at least 1, got 2.5"),
     "a folder as sr": ({"sr": "sr_x4"}, "sr: must be a function or a prior, got 'sr_x4': of a folder"),
-    "channels first": ({"image": PHOTO.image.permute(2, 0, 1)}, r"image: must have shape \[h, w, 3\], got \(3, 16, 24\)"),
-    "a 4x4 K": ({"K": torch.eye(4)}, r"K: must have shape \[3, 3\], got \(4, 4\)"),
-    "a mask of one channel": ({"mask": torch.ones(16, 24, 1)}, r"mask: must have shape \(16, 24\), got \(16, 24, 1\)"),
+    "channels first": ({"image": PHOTO.image.permute(2, 0, 1)}, r"image: must have shape \[h, w, 3\], got \[3, 16, 24\]"),
+    "skew": ({"K": torch.ones(3, 3)}, r"photo: K: must be \[\[fx, 0, cx\]"),
+    "a 4x4 K": ({"K": torch.eye(4)}, r"K: must have shape \[3, 3\], got \[4, 4\]"),
+    "a mask of one channel": ({"mask": torch.ones(16, 24, 1)}, r"mask: must have shape \[16, 24\], got \[16, 24, 1\]"),
     "a mask of levels": ({"mask": torch.full((16, 24), 255, dtype=torch.uint8)}, r"mask: must lie in \[0, 1\]"),
 }  # fmt: skip
 
