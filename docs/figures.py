@@ -12,9 +12,7 @@ python docs/figures.py notebook            runs docs/tutorial/notebook.ipynb and
 from __future__ import annotations
 
 import base64
-import csv
 import os
-import re
 import subprocess
 import sys
 import tempfile
@@ -24,6 +22,7 @@ from typing import Any, Final
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
+import pandas as pd
 import sweep_figures  # beside this file, as style
 from style import save
 
@@ -38,34 +37,27 @@ def csv_file(name: str) -> Path:
     return DOCS / "data" / "evidence" / f"{name}.csv"
 
 
-def table(name: str) -> list[dict[str, str]]:
-    with csv_file(name).open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+def table(name: str) -> pd.DataFrame:
+    return pd.read_csv(csv_file(name))
 
 
-def numbers(cell: str) -> list[float]:
-    """The values of a cell: "+0.07, +0.19 (0.5)" holds two."""
-    values = re.sub(r"\(.*?\)", "", cell).split("±")[0]
-    return [float(part) for part in values.replace(",", " ").split()]
-
-
-def error(cell: str) -> float:
-    """The number after ±; 0 without one."""
-    return float(cell.partition("±")[2] or 0)
+def measured(cells: pd.Series) -> tuple[pd.Series, pd.Series]:
+    """The first number of each cell, and the one after ±; 0 without one."""
+    parts = cells.str.extract(r"([-+.\d]+)(?:.*± ([.\d]+))?").astype(float)
+    return parts[0], parts[1].fillna(0)
 
 
 def ablation(folder: Path) -> None:
-    rows = [row for row in table("ablation") if row["Δ"]]
-    methods = list(dict.fromkeys(row["method"] for row in rows))[1:]
-    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    rows = table("ablation").dropna(subset="Δ")
+    methods, scenes = list(rows["method"].unique())[1:], list(rows["scene"].unique())
     figure, axes = plt.subplots(figsize=(7, 3))
     for k, scene in enumerate(scenes):
-        gains = {row["method"]: row["Δ"] for row in rows if row["scene"] == scene}
+        gains, errors = measured(rows[rows["scene"] == scene].set_index("method")["Δ"].loc[methods])
         average = scene.startswith("average")
         axes.errorbar(
             [i + 0.11 * (k - (len(scenes) - 1) / 2) for i in range(len(methods))],
-            [numbers(gains[m])[0] for m in methods],
-            [error(gains[m]) for m in methods],
+            gains,
+            errors,
             fmt="D" if average else "o",
             color="black" if average else None,
             markersize=6 if average else 4,
@@ -80,13 +72,13 @@ def ablation(folder: Path) -> None:
 
 
 def skips(folder: Path) -> None:
-    rows = [row for row in table("skips") if row["scene"] != "average"]
+    rows = table("skips").query("scene != 'average'")
     figure, axes = plt.subplots(figsize=(7, 2.6))
-    for row in rows:
-        seconds = [float(row["seconds, all drawn"]), float(row["seconds, default skips"])]
-        psnr = [float(row["PSNR, all drawn"]), float(row["PSNR, default skips"])]
-        (line,) = axes.plot(seconds, [p - psnr[0] for p in psnr], marker="o", label=row["scene"])
-        axes.errorbar(seconds[1], psnr[1] - psnr[0], error(row["Δ"]), color=line.get_color(), elinewidth=1)
+    for (_, row), error in zip(rows.iterrows(), measured(rows["Δ"])[1], strict=True):
+        seconds = row[["seconds, all drawn", "seconds, default skips"]]
+        gain = row["PSNR, default skips"] - row["PSNR, all drawn"]
+        (line,) = axes.plot(seconds, [0, gain], marker="o", label=row["scene"])
+        axes.errorbar(seconds.iloc[1], gain, error, color=line.get_color(), elinewidth=1)
     axes.axhline(0, color=GREY, linewidth=1, zorder=0)
     axes.set(xlabel="seconds (right: everything drawn, left: default skips)", ylabel="Δ PSNR, dB")
     axes.legend()
@@ -96,22 +88,19 @@ def skips(folder: Path) -> None:
 def best(folder: Path) -> None:
     rows = table("best_today")
     figure, axes = plt.subplots(figsize=(7, 2.4))
-    places, gains = range(len(rows)), [numbers(row["Δ best"])[0] for row in rows]
-    colors = ["black" if row["scene"].startswith("average") else "C0" for row in rows]
-    axes.bar(places, gains, yerr=[error(row["Δ best"]) for row in rows], color=colors, width=0.6)
+    places, (gains, errors), (psnr, _) = range(len(rows)), measured(rows["Δ best"]), measured(rows["baseline"])
+    colors = ["black" if scene.startswith("average") else "C0" for scene in rows["scene"]]
+    axes.bar(places, gains, yerr=errors, color=colors, width=0.6)
     axes.axhline(0, color=GREY, linewidth=1)
-    axes.set_xticks(places, [f"{row['scene']}\n{numbers(row['baseline'])[0]:.2f} dB" for row in rows])
+    axes.set_xticks(places, [f"{scene}\n{dB:.2f} dB" for scene, dB in zip(rows["scene"], psnr, strict=True)])
     axes.set_ylabel("Δ PSNR of best, dB")
     save(figure, folder / "evidence_best.svg")
 
 
 def hosts(folder: Path) -> None:
-    means = {  # the last of several
-        (row["host"], row["points"], row["strategies"]): float(row["PSNR at HR (dB)"])
-        for row in table("hosts_best")
-        if row["scene"] == "both"
-    }
-    names = list(dict.fromkeys(host for host, *_ in means))
+    rows = table("hosts_best").query("scene == 'both'")
+    means = rows.groupby(["host", "points", "strategies"])["PSNR at HR (dB)"].last().astype(float)  # of several dates
+    names = list(rows["host"].unique())
     series = (("own", "none"), ("stereo", "clear"), ("stereo", "best"))
     figure, axes = plt.subplots(figsize=(7, 2.4))
     for k, (points, strategies) in enumerate(series):
@@ -128,10 +117,8 @@ def conflict(folder: Path) -> None:
     """The share of Gaussians whose LR and HR gradients oppose: by the number of views, and in training."""
     figure, (by_views, in_training) = plt.subplots(1, 2, figsize=(7, 2.6))
     for axes, name, x in ((by_views, "conflict_by_views", "views"), (in_training, "conflict_in_training", "iteration")):
-        rows = table(name)
-        for method in dict.fromkeys(row["method"] for row in rows):
-            of_method = [(float(row[x]), float(row["conflict"])) for row in rows if row["method"] == method]
-            axes.plot(*zip(*of_method, strict=True), marker="o" if x == "views" else None, markersize=4, label=method)
+        for method, rows in table(name).groupby("method", sort=False):
+            axes.plot(rows[x], rows["conflict"], marker="o" if x == "views" else None, markersize=4, label=method)
         axes.set_xlabel(f"training {x}" if x == "views" else x)
         axes.legend()
     by_views.set_ylabel("Gaussians in conflict")
@@ -140,14 +127,11 @@ def conflict(folder: Path) -> None:
 
 def training_time(folder: Path) -> None:
     """PSNR of the test views against CPU seconds of training, of one stage and of two."""
-    rows = table("training_time")
-    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    scenes = table("training_time").groupby("scene", sort=False)
     figure, all_axes = plt.subplots(1, len(scenes), figsize=(7, 2.4), squeeze=False)
-    for axes, scene in zip(all_axes[0], scenes, strict=True):
-        for method in dict.fromkeys(row["method"] for row in rows):
-            of_run = [row for row in rows if (row["scene"], row["method"]) == (scene, method)]
-            seconds, psnr = ([float(row[key]) for row in of_run] for key in ("CPU seconds", "PSNR (dB)"))
-            axes.plot(seconds, psnr, marker=".", label=method)
+    for axes, (scene, of_scene) in zip(all_axes[0], scenes, strict=True):
+        for method, run in of_scene.groupby("method", sort=False):
+            axes.plot(run["CPU seconds"], run["PSNR (dB)"], marker=".", label=method)
         axes.set(title=scene, xlabel="CPU seconds")
     all_axes[0][0].set_ylabel("PSNR of the test views, dB")
     all_axes[0][0].legend()
