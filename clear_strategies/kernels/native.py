@@ -18,7 +18,7 @@ def fastest(device: torch.device) -> Literal["cpp", "warp", "torch"]:
     """What computes float32 on this device: C++ on a CPU, Warp on CUDA, torch where these do not run."""
     if device.type == "cpu" and available():
         return "cpp"
-    return "warp" if device.type == "cuda" and runs_warp("cuda") else "torch"
+    return "warp" if device.type == "cuda" and runs_warp() else "torch"
 
 
 def implementation(package: str, *tensors: Tensor) -> ModuleType:

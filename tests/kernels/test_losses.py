@@ -310,9 +310,9 @@ def chosen(x, y):
 
 def test_auto_uses_warp_on_cuda_only_where_it_runs(monkeypatch):
     x = torch.rand(4, 5, 3)
-    monkeypatch.setattr(native, "runs_warp", lambda device: False)
+    monkeypatch.setattr(native, "runs_warp", lambda: False)
     assert chosen(on_cuda(), on_cuda()) == "reference"
-    monkeypatch.setattr(native, "runs_warp", lambda device: True)
+    monkeypatch.setattr(native, "runs_warp", lambda: True)
     assert chosen(on_cuda(), on_cuda()) == "warp"
     assert chosen(on_cuda(), x) == "reference"
     assert chosen(on_cuda(torch.float64), on_cuda(torch.float64)) == "reference"
