@@ -42,7 +42,7 @@ class ConductorSettings:
     Args:
         strategies: by the names that the configuration gives them.
         decorators: of the prior, by name; each takes a prior and returns one.
-        statistics_from: see `Conductor`; written for 10,000 iterations, as every milestone.
+        statistics_from: the iteration from which densification reads the HR render, a milestone; see `Conductor`.
     """
 
     objective: Objective

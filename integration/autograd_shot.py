@@ -101,10 +101,11 @@ class AutogradShot:
         slot: where the host keeps the screen gradient; None: the image is a function of `means2d` itself.
         drawn: the rasterizer's means, quats, scales, opacities and colors, none of them with a hook or computed from another;
             None: `joint_loss` and hosts find them where a network needs them.
-        drawings: of this image by this package's rasterizers; a single one takes all cotangents in one pass.
-        mask: the image is a drawing outside of any graph, times this mask.
+        drawings: the drawings by this package's rasterizers from which the image is made; a single one takes all cotangents in
+            one pass.
+        mask: factor of the image, if it is a drawing outside of any autograd graph.
         found: the inputs of another rasterizer, which `joint_loss` and hosts set.
-        around: inputs of the rasterizer beside `drawn`, as the camera; what they are computed from learns from LR alone.
+        around: other inputs of the rasterizer, such as the camera; what they are computed from learns from LR alone.
         of_others: receives the gradients of other leaves in each `vjp`.
 
     Raises:
@@ -377,8 +378,9 @@ class HostOutput:
     """The result of a host's render function, as its adapter passes it to an `Attachment`.
 
     Args:
-        marks: tensors that every backward pass over the rendering reaches before any parameter; a drawing by this package's
-            rasterizers needs none. Of a view pass the base, whose node stays if the host writes to the view in place.
+        marks: tensors that every backward pass over the rendering reaches before any parameter, such as the image; not needed
+            if one of this package's rasterizers drew it. For a torch view, pass its base, whose autograd node stays if the host
+            writes to the view in place.
         returned: the return value of the host's render function.
     """
 

@@ -20,18 +20,18 @@ class Host:
     Args:
         params: returns the leaves that the host optimizes, by gsplat's names (and "detail"). It is called at every
             iteration, since densifiers replace parameters.
-        poll_parents: called at every iteration. It returns parents[M] if the structure has changed since its last call (row i of
-            every parameter now comes from row parents[i], or from none if that is -1); None: it has not, or the host does not
-            say how.
-        restart_parents: called after the host has loaded other parameters, which come from no earlier ones.
-        remedy: for the error if strategies store something per Gaussian, but some Gaussians come from no other.
-        threshold: on the mean ‖∇_u‖ in NDC units, by which the host densifies; None: it reads no score.
+        poll_parents: called at every iteration. Returns parents[M] if the structure has changed since the last call: row i of
+            every parameter now comes from row parents[i], or is new if that is -1. Returns None if it has not changed, or the
+            host does not say how.
+        restart_parents: called after the host has loaded other parameters, whose rows come from no earlier ones.
+        remedy: the end of the error message if strategies store something for each Gaussian, but some Gaussians are new.
+        threshold: the host's densification threshold, on the mean ‖∇_u‖ in NDC units; None: the host reads no score.
         loss_scale: returns the factor of the loss (`scaler.get_scale` of an AMP gradient scaler).
-        accumulation: backward passes per optimizer step, if the host divides each loss by this number, and the schedules count
-            steps; 1: it sums the losses of several views, or a step has only one, and they count views.
-        masks: [h, w] by the name of a view, by which the host multiplies its LR image; the HR image is multiplied here.
-        own_background: the host chooses the colour behind its renderings, and `Attachment.background` has no effect.
-        iterations: of the loop, if they are known.
+        accumulation: backward passes per optimizer step, if the host divides each loss by this number; schedules then count
+            steps. 1: the host does not divide; schedules count views.
+        masks: [h, w] by the name of a view. The host multiplies its LR image by the mask; the HR image is multiplied here.
+        own_background: True if the host chooses the colour behind its renderings; `Attachment.background` then has no effect.
+        iterations: length of the loop, if it is known.
 
     Raises:
         SettingError: `accumulation` is not a whole number >= 1.

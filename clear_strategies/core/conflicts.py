@@ -47,8 +47,8 @@ class Weights(NamedTuple):
     """ĝ_HR = keep · g_HR - remove · g_LR, for each Gaussian and group.
 
     Args:
-        keep, remove: a number, or a tensor of one for each Gaussian [N], or also for each of `CONFLICT_GROUPS` [N, G], of any
-            type, on the device of the gradients.
+        keep, remove: a number, or a tensor on the device of the gradients, of any type: [N], one number for each Gaussian, or
+            [N, G], one for each Gaussian and each of `CONFLICT_GROUPS`.
     """
 
     keep: float | Float[Tensor, " N"] | Float[Tensor, "N G"] = 1.0

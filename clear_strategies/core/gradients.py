@@ -143,7 +143,8 @@ class Shot(Protocol):
         """∇θ of Σ cotangent·image on the raw parameters, one per cotangent, each with `.screen`.
 
         Args:
-            weight: the last two are summed by it, see `summed`; None: nothing is. A shot of one's own may lack it.
+            weight: the last gradient times this is added to the one before, see `summed`; None: nothing is added. A shot of
+                your own may lack the argument.
         """
         ...
 

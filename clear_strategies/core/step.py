@@ -24,7 +24,7 @@ class Step:
         visible: the Gaussians that the HR render shows, [N]; None in an iteration without HR.
         evidence: the answer of `Strategy.observe`; None before it, and where no strategy gives one.
         params: raw parameters by attribute (log scales, logit opacities), to read; empty where the structure has changed since.
-        looked_up: in a recorded iteration, `looked_up` of the strategy that observes; None: the strategy calls it itself.
+        looked_up: if the iteration is replayed, what `Strategy.looked_up` returned for the view; None: the strategy calls it.
     """
 
     t: int

@@ -58,15 +58,15 @@ class CloudSettings:
             there is no depth and no other view looks through them. Random points are never densified.
         stride: see `densify`, LR px.
         random_points: how many for init=random.
-        box: half-edge of their box around the origin, world units; None: the box that the cameras have in common.
+        box: half the edge of the box of random points around the origin, world units; None: one in the view of all cameras.
         outlier_neighbours, outlier_ratio: a point is removed if the mean distance to its nearest `outlier_neighbours`
             points (itself included) exceeds the average by more than `outlier_ratio` standard deviations; 0
             neighbours: no point is removed.
         voxel: points are averaged in cubes of this edge, world units, by Open3D (extra [open3d]); None: they are not.
-        compare: the images that stereo compares. "hr": those at HR, up to `stereo.max_pixels`. Where these are photos, maps and
-            points are made at their size; where a prior made them, their depth completes that of the LR photos, except before a
-            plain background. "lr": the LR photos. "auto": as "hr", but SR images of at most five photos only: with more
-            photos, the LR photos give the same depth in a fraction of the time.
+        compare: the images that stereo compares. "lr": the LR photos. "hr": the HR images, up to `stereo.max_pixels`. If these
+            are photos, maps and points are made at their size; if they are SR images, their depth completes that of the LR
+            photos, except before a plain background. "auto": as "hr", but with more than five photos no SR images, since the
+            LR photos then give the same depth in a fraction of the time.
         max_points: a larger cloud is reduced to this many points, chosen at random.
         triangulation: for init=stereo, triangulated and auto.
         stereo: for init=stereo and auto.

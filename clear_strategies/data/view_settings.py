@@ -30,13 +30,13 @@ class ViewSettings:
     Args:
         train: the number of training views, evenly spaced among those that are not for testing; None: all of them.
         train_names: exactly these training views instead, by name or file name, with or without its ending.
-        test_every: every view of this number, in order of names, is for testing, unless the data set has its own split;
-            None or 0: none is.
-        own_split: keep to the data set's own split, if it has one; false: all of its views are alike.
+        test_every: n: every n-th view, in order of names, is for testing, unless the data set has its own split; None or 0:
+            none is.
+        own_split: keep the data set's own split into training and test views, if it has one. If false, it is ignored.
         test_limit: at most this many test views, evenly spaced; None: all.
         sr_scale: HR pixels per LR pixel, at most: see `max_hr_megapixels`.
-        max_hr_megapixels: the largest HR image with photos_are=lr. Above it, HR is twice as large as the photos, or the photos
-            themselves, reduced to this size, are the HR side: `within_limit`. None: no limit.
+        max_hr_megapixels: the largest HR image with photos_are=lr. If sr_scale times the photos are larger, HR is twice as large
+            as the photos, or the photos themselves, reduced to this size, are HR. None: no limit.
         shrink: the photos are first reduced by this whole factor (LLFF at 1/8 and 1/2 of its full size: 2).
         sizes: what happens to photos whose sizes are no multiples of shrink · sr_scale. "crop": they lose a few pixels
             at the right and the bottom. "round": they are resized to sr_scale · round(size / (shrink · sr_scale)).
@@ -44,7 +44,7 @@ class ViewSettings:
             training never uses, and LR is made from them, as in the papers. "both": they are the HR images in place of SR
             images, and LR is made from them.
         downsample: D, the operator that makes LR.
-        lr_folder: ready-made LR images by the photos' names, as prior=images finds them, instead of making them.
+        lr_folder: a folder of LR images with the photos' names, as prior=images finds them; None: they are made.
         equalize: scale the training photos to a common exposure and white balance, by a gain for each photo and channel
             (`clear_strategies.geometry.exposure_gains`); needs the depth of data.cloud.init=stereo or auto. Test photos stay as
             they are.

@@ -53,7 +53,7 @@ class MCMC(Strategy):
         every: iterations between rounds of relocation and growth.
         growth: the share of Gaussians that a round adds, up to the cap.
         per_point: the cap, as a multiple of the initial number of Gaussians, one for each initial point.
-        max_gaussians: an upper bound of the cap.
+        max_gaussians: the largest cap.
         min_gaussians: having fewer Gaussians above `dead_opacity` is an error, unless all are.
         dead_opacity: Gaussians of at most this opacity are relocated.
         noise: strength of the noise. A Gaussian of covariance Σ moves by noise(t) σ(100 (dead_opacity - opacity)) Σ η / s̃ after

@@ -40,7 +40,7 @@ class DataSettings:
     Args:
         reader: reads the capture; called after every setting has been checked.
         save_lr: write the LR images to this folder, for an external SR model, and stop.
-        path, root, scene: for the interpolations of conf/: the scene's folder, the folder of the scenes' folders, and the
+        path, root, scene: what the files of conf/ refer to: the scene's folder, the folder of the scenes' folders, and the
             name of one of them.
     """
 

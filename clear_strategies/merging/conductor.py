@@ -150,8 +150,9 @@ class Conductor(Hooks):
         """The merged gradient of one view, in place of `backward()`.
 
         Args:
-            params: raw parameters by attribute. lr, hr: this view rendered at both scales. hr None skips HR; lr None
-                stands for the area mean of hr, where `wants_lr` is False or both scales have one size.
+            params: raw parameters by attribute.
+            lr, hr: this view rendered at both scales. hr=None leaves HR out; with lr=None, LR is the area mean of hr, if
+                `wants_lr` is False or both scales have one size.
             scored, looked_up: see `gradients`.
 
         Raises:

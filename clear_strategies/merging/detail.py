@@ -17,7 +17,7 @@ class DetailRates:
     """Learning rate and decay of f_det.
 
     Args:
-        rate: Adam's, of f_det as an offset of RGB (F34).
+        rate: learning rate of Adam for f_det, an offset of RGB (F34).
         steps: a run of fewer iterations gives f_det a share of its rate in proportion; 0: always the whole rate. In RGB, f_base
             moves at 0.28 of the rate of its SH coefficients, and a short run ends before it has followed f_det.
         decay: share of f_det, in [0, 1), that is lost at every step in which HR takes part. L_HF does not change with a

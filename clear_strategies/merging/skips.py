@@ -38,17 +38,18 @@ class Skips:
     """Settings of skipped work. The defaults skip nothing.
 
     Args:
-        coarse_until: until this iteration HR is rendered and compared at half its size, and LR is not rendered where that is
-            LR's size; 0: never, by which 10,000 steps in gsplat's loop gained 0.27 dB and took 1.4 times as long (`clear`, demo).
-        hr_every: until then, HR is rendered and compared in one of so many iterations, and in each whose scores densification
-            reads; 1: in each.
-        plateau_gain: once the loss of the training views, rendered with all Gaussians, has not fallen by at least this share
-            within a window, training continues at iteration `plateau_to`; 0: never.
+        coarse_until: until this iteration, HR is rendered and compared at half its size; if that is the size of LR, LR is not
+            rendered. 0: never; 10,000 steps of `clear` in gsplat's loop on the demo then gain 0.27 dB in 1.4 times the time.
+        hr_every: until `coarse_until`, HR is rendered in one of this many iterations, and in all whose scores densification
+            reads; 1: in all.
+        plateau_gain: if the loss of the training views, rendered with all Gaussians, falls by less than this share within a
+            window, training jumps to iteration `plateau_to`; 0: never.
         plateau_window: iterations between two measurements, at least six for each training view.
         plateau_from: iteration of the earliest measurement.
-        plateau_to: iteration from which every run trains: the learning rates fall, and HR is at full size.
+        plateau_to: where the jump ends. No run skips the iterations from here on, in which the learning rates fall, and HR is at
+            full size.
         undrawn: once densification has ended, Gaussians too faint to be drawn in any view are removed if they are at least
-            this share of all and no strategy regularizes; 0: never.
+            this share of all, and no strategy regularizes; 0: never.
     """
 
     coarse_until: int = milestone(0)

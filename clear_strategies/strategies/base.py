@@ -69,15 +69,14 @@ class Strategy:
     """A frozen dataclass of settings, plus its state.
 
     Args:
-        state: tensors [N, …] of the Gaussians, which `on_resize` gathers, and tensors without dimensions, numbers of the run;
-            nothing else. Checkpoints save them.
-        run_state: other tensors that checkpoints save, of any shape: parameters of the strategy's own, by view or by group.
+        state: tensors [N, …] with a row for each Gaussian, which `on_resize` gathers, and scalar tensors. Checkpoints save them.
+        run_state: tensors of any other shape, such as parameters for each view. Checkpoints save them.
         cache: values that can be computed again (patch maps, keyed by view); never saved.
         logs: scalars of this iteration, see `log`.
-        of_run: device, seed, λ_HR and activations of the run, an object that its strategies share.
+        of_run: device, seed, λ_HR and activations of the run; all strategies of a run share the object.
 
-    Randomness must be a function of (seed, t), so that resuming needs no generator state. Hooks run without autograd. Copies and
-    pickles have the settings alone, for a run of their own.
+    Random numbers must be a function of (seed, t), so that resuming needs no generator state. Hooks run without autograd. A copy
+    or a pickle has only the settings, for another run.
     """
 
     state: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
@@ -100,31 +99,30 @@ class Strategy:
     # ---- hooks, in the order in which this trainer calls them --------------------------------------------------------
 
     def densifier(self, field: Any, views: Sequence[View], seed: int) -> Any:
-        """Once, before the first iteration: what clones, moves and prunes Gaussians in place of the trainer's own density
-        control, a `clear_strategies.training.densifier.Densifier`; None: the trainer does.
+        """Once, before the first iteration: a `clear_strategies.training.densifier.Densifier`, which clones, moves and prunes
+        Gaussians instead of `density`; None: `density` does. Other trainers keep their own density control, and never call this.
 
         Args:
-            field: the initial Gaussians, a `clear_strategies.training.field.GaussianField`. Other trainers never call this hook,
-                since they keep their own density control.
+            field: the initial Gaussians, a `clear_strategies.training.field.GaussianField`.
             views: all training views.
         """
         return None
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
-        """Start a run, or resume one; without a conductor, on the present device. Overriders need not call `super()`."""
+        """Start a run, or resume one. An override need not call `super()`."""
         self._forget(RunFacts(self.device, int(seed)))  # arithmetic with numpy's numbers overflows
 
     def on_views(self, views: Sequence[View]) -> None:
         """Look at all training views once, after `on_fit_start`.
 
         Args:
-            views: on the device of the field; empty where the training loop does not have them all at the start.
+            views: on the device of the field; empty if the training loop does not have all of them at the start.
         """
 
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | Float[Tensor, "2 N"] | None:
-        """Before render: which Gaussians take part? z >= 0 multiplies the opacity; None: all of them.  Eq. 15
+        """Before render: which Gaussians take part? z >= 0 multiplies the opacities; None: all take part.  Eq. 15
 
-        Two rows, of LR and of HR, where `shares_gate` is false.
+        If `shares_gate` is false, z has two rows, for LR and for HR.
         """
         return None
 
@@ -141,8 +139,9 @@ class Strategy:
         compared by the objective alone.
 
         Args:
-            photo: the photo of LR, or the SR image, over the background of the iteration. step: without `visible` and evidence.
-            losses: compares an image with the photo, by the strategies after this one and the objective. To be called once; the
+            photo: the LR photo or the SR image, over the background of the iteration.
+            step: without `visible` and evidence.
+            losses: compares an image with the photo, by the strategies after this one and the objective. Call it once; the
                 cotangents that it returns may be changed in place.
         """
         return losses(image)
@@ -162,8 +161,9 @@ class Strategy:
     def score(self, step: Step, screen: ScreenGradients) -> Float[Tensor, " N"] | None:
         """For densification: where is more structure needed? None: the ordinary statistic.  Eq. 14
 
-        Its order counts, not its unit: as many Gaussians grow as the ordinary statistic lets grow, those of the largest mean over
-        the views that show them (`density.mode=quantile`). In other trainers it is scaled so that as many pass their threshold.
+        Only the order of the scores counts: they are averaged over the views that show a Gaussian, and as many Gaussians grow as
+        would by the ordinary statistic, those with the largest means (`density.mode=quantile`). In other trainers the scores are
+        scaled so that as many Gaussians pass the threshold.
         """
         return None
 
@@ -171,19 +171,19 @@ class Strategy:
         """How to reconcile both gradients? ĝ_HR = keep · g_HR - remove · g_LR; g_LR is never changed.  Eq. 6, 7, 11
 
         Args:
-            products: how the two relate, by Gaussian and attribute group.
-            step: the iteration, with the evidence; None in a call of `correct` that names none.
+            products: dot product and squared norms of the two gradients, for each Gaussian and attribute group.
+            step: the iteration, with the evidence; None if `correct` was called without one.
         """
         return Weights()
 
     def correct(self, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor], step: Step | None = None) -> Grads:
-        """ĝ_HR, from two gradients by attribute: by the weights of `reconcile`.
+        """ĝ_HR, from two gradients by attribute. The default applies the weights of `reconcile`.
 
         A strategy that decides number by number overrides this hook instead of `reconcile`, and gets both gradients in full.
 
         Args:
-            lr, hr: attribute -> gradient [N, …], any of `CONFLICT_GROUPS`. A group that only one of them has is not compared,
-                and a gradient that is None is left out.
+            lr, hr: attribute -> gradient [N, …], any of `CONFLICT_GROUPS`. A group that only one of them has is not compared;
+                None is left out.
 
         Raises:
             ValueError: both have gradients, but no group in common.
@@ -204,15 +204,16 @@ class Strategy:
         """Before the extra views of t: render the field, e.g. to make extra views of it. Other trainers never call this hook.
 
         Args:
-            means: of the field. enlarged: renders the field by a camera, without f_det, and enlarges the picture by a whole
-                factor, by the network of the prior or, if it has none, bicubically.
+            means: positions of the Gaussians.
+            enlarged: renders the field by a camera, without f_det, and enlarges the picture by a whole factor, with the network
+                of the prior or, if it has none, bicubically.
         """
 
     def extra_views(self, t: int) -> Sequence[ExtraView]:
         """Which other pictures should the field match at t? Several strategies may answer.
 
         Each is rendered once, without dropout and f_det, and gets an optimizer step of its own on the LR loss, after the step
-        of the iteration's view. Evidence, conflicts, densification and regularization ignore it.
+        of the iteration's view. It has no part in evidence, conflicts, densification and regularization.
         """
         return ()
 
@@ -244,7 +245,7 @@ class Strategy:
         return None
 
     def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
-        """Why the strategy changes nothing under these loss weights; None where it has an effect.
+        """Why the strategy changes nothing with these loss weights; None if it has an effect.
 
         Args:
             lambda_hr: the largest λ_HR(t) of the run.
@@ -262,19 +263,21 @@ class Strategy:
         return None
 
     def looked_up(self, view: View) -> Tensor | None:
-        """All that `observe`, `route` and `score` know of a view, as one tensor, e.g. P2G's patch maps; None: they read the view.
+        """All that `observe`, `route` and `score` read of a view, as one tensor, e.g. P2G's patch maps; None: they read the view.
 
-        On a GPU, iterations are then recorded. A replay is for another view: it copies the tensor of that view to where the
-        recorded hooks read, which is `Step.looked_up`. A subclass that overrides one of the three hooks overrides this one, too.
+        With such a tensor, iterations on a GPU can be replayed: a replay copies the tensor of its view to `Step.looked_up`, where
+        the recorded hooks read it. A subclass that overrides one of the three hooks must override this one, too.
         """
         return None
 
     # ---- for subclasses ---------------------------------------------------------------------------------------------
 
     def log(self, name: str, value: Logged) -> None:
-        """Log a scalar of this iteration, or a function that computes it, which is called before the next iteration if at all: a
-        host calls it in every hundredth. A 0-dim tensor on a device is read later, see `core.deferred`. If another strategy has
-        logged the same name, the column is "<class>.<name>". Without a conductor, `merging.logs.computed(self.logs)` has them.
+        """Log a scalar of this iteration, or a function that computes it.
+
+        The function is called only if the log is read (in a host, in every hundredth iteration), and before the next iteration. A
+        0-dim tensor on a device is read later, see `core.deferred`. If another strategy has logged the same name, the column is
+        "<class>.<name>". Without a conductor, read the logs by `merging.logs.computed(self.logs)`.
         """
         is_number = value.dim() == 0 if isinstance(value, Tensor) else isinstance(value, (Real, Deferred))
         if not (is_number or callable(value)):
@@ -298,9 +301,9 @@ class Strategy:
         return self.of_run.lambda_hr(t)
 
     def splats(self, params: Mapping[str, Tensor]) -> Splats:
-        """Raw parameters of as many Gaussians as the field has, activated as the run draws them, without f_det. Differentiable.
+        """Activate raw parameters of all Gaussians as the run does, without f_det. Differentiable.
 
-        In this trainer the 3D filter of the field makes them larger and fainter; other trainers' own filters are left out.
+        In this trainer, the 3D filter is applied; filters of other trainers are left out.
         """
         return self.of_run.splats(params)
 

@@ -47,16 +47,15 @@ class GCO(Strategy):
         tolerance: τ_c in [0, 1): cosines down to -τ_c are no conflict.
         weight_min, weight_max: bounds of ω where a conflict is corrected, 0 <= min <= max <= 1.
         groups: the attributes that are compared and corrected, each separately.
-        whole: compare a Gaussian as a whole instead, all groups together. Neither this nor `drop` is the paper's; see
-            experiment=claims.
-        drop: leave out a conflicting HR gradient instead of correcting it.
-        keep_length: without evidence, scale ĝ_HR to the length of g_HR: what opposes LR is turned and not weakened, since nothing
-            tells that it is wrong. What is exactly opposite, as each conflict of opacities, passes as it is. False: the paper's
-            (F31).
+        whole: compare a Gaussian as a whole, all groups together. Not in the paper; see experiment=claims.
+        drop: leave out a conflicting HR gradient instead of correcting it. Not in the paper; see experiment=claims.
+        keep_length: without evidence, scale ĝ_HR to the length of g_HR. A gradient that opposes LR is then turned and not
+            weakened, since nothing says that it is wrong; one that is exactly opposite, as in each conflict of opacities, stays
+            as it is. False: as in the paper (F31).
 
     There is no ε: products are in float64, where those of float32 gradients do not vanish, and a zero norm is no conflict (F27).
     The opacity group has one dimension: its cosine is ±1, so every disagreement is a full conflict.
-    Without evidence q = 0 (F32). As the paper has it, LR then prevails: 0.29 of an opposite HR gradient is left.
+    Without evidence q = 0 (F32), by which the paper's formula leaves 0.29 of an opposite HR gradient.
 
     Raises:
         SettingError: a setting is outside its range.

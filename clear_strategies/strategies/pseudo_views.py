@@ -41,7 +41,7 @@ class PseudoViews(Strategy):
         every: iterations from one pseudo view to the next, at least 1.
         count: the number of different pseudo views, at least 1; fewer if they would have more than 16 million pixels together.
         reach: largest distance of a pseudo camera from its photo's, > 0, as a multiple of the photo's median depth.
-        weight: of their LR loss, > 0, as a multiple of λ_LR, a photo's.
+        weight: weight of the LR loss of a pseudo view, > 0, as a multiple of λ_LR.
         tolerance: largest relative difference, > 0, between the depth of a point and that of a photo that shows its colour.
         continued: weight of the pixels that no photo shows, in [0, 1], as a multiple of `weight`: they continue the surrounding
             colours smoothly. 0: they have no weight, and there are no views of borders.

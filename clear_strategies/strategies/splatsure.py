@@ -40,7 +40,7 @@ class SplatSuRe(Strategy):
 
     Args:
         ratio: τ, the ratio of the finest to the coarsest sampling rate at which half of the HR gradient is withheld.
-        softness: of the sigmoid around τ, > 0.
+        softness: width of the sigmoid around τ, > 0.
         min_views: Gaussians that are visible in fewer views keep all of their HR gradient.
 
     Raises:

@@ -33,9 +33,9 @@ class SRStage(Strategy):
 
     Args:
         start: the last iteration of the first stage.
-        count: of pictures beside the training cameras, at least 0.
+        count: number of pictures from cameras beside the training cameras, at least 0.
         reach: as that of `PseudoViews`, as a multiple of a camera's distance from the middle of the Gaussians.
-        weight: of the loss of an HR picture, > 0, as a multiple of a photo's LR loss.
+        weight: weight of the loss of an HR picture, > 0, as a multiple of a photo's LR loss.
 
     Raises:
         SettingError: a setting is outside its range.

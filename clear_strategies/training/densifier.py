@@ -20,7 +20,8 @@ class Densifier:
     """Changes the structure of the field while it trains.
 
     Attributes:
-        name: in the printed plan. settings: a dataclass; its milestones are printed.
+        name: its name in the plan of a run.
+        settings: a dataclass, whose milestones the plan shows.
         cap: the most Gaussians that it lets the field have; None: any number.
     """
 

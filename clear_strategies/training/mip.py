@@ -32,7 +32,7 @@ class MipFilter:
     """Settings of the 3D filter: when it is computed, and from which cameras.
 
     Args:
-        variance: of the filter, in squared sampling intervals (px² at the finest camera); 0 switches it off.
+        variance: variance of the filter, in squared sampling intervals (px² of the finest camera); 0: no filter.
         cameras: which training cameras set the sampling rate; the finer ones are "hr".
         every: iterations between updates; every change of structure updates the filter as well.
         last: no update in this many last iterations of a run.

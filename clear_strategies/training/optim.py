@@ -32,12 +32,12 @@ class LearningRates:
     Args:
         means: log-linear decay, in units of the scene's extent.
         quats, scales, opacities, sh0, shN: of the raw parameters (any norm, log, logit, SH coefficients).
-        detail, detail_steps, detail_decay: rate, steps and decay of `DetailRates`.
+        detail, detail_steps, detail_decay: of f_det: rate, steps and decay of `DetailRates`.
         geometry_steps: the iterations that the rates of means, scales and quats are for. In a run of T < geometry_steps
             these are (geometry_steps / T)^(1/3) times as high, see `of_run`; 0: as they stand in a run of any length.
         cool_from, end: between these iterations all rates fall linearly to 0, except for that of the means, which always falls.
             A run then ends on what its views agree on and not on the last view. Equal: no rate falls.
-        eps: Adam's. Gradients of mean losses are near 1e-6, so torch's default of 1e-8 would freeze the small ones.
+        eps: ε of Adam. Gradients of mean losses are near 1e-6, so torch's default of 1e-8 would freeze the small ones.
     """
 
     means: LogLinear = field(default_factory=LogLinear)

@@ -19,30 +19,30 @@ class FitSettings:
     Args:
         iterations: optimizer steps, one view each.
         scale_schedule: stretch every milestone from 10,000 iterations to `iterations`.
-        seed: of view order, dropout and splits, 64 bits with sign.
-        max_degree: of spherical harmonics, 0 to 3.
-        degree_every: iterations after which one more degree becomes active.
+        seed: of all random numbers, such as the order of views, dropout and splits; 64 bits with sign.
+        max_degree: the highest degree of the spherical harmonics, 0 to 3.
+        degree_every: iterations after which the next degree is trained, too.
         probe_every: iterations between evaluations of the test views; 0: never.
         probe_views: how many test views these evaluate.
         checkpoint_every: iterations between checkpoints; 0: only at the end, or when interrupted.
         keep: how many checkpoints stay, at least 1.
         memory: MiB that training may take, loading included; None: what is free on this machine. More is refused before the
             first iteration.
-        fused: "auto" merges, corrects, anchors and steps in one compiled pass where it can, and skips rows that would
-            not move; "off" takes the readable path.
-        replay: record iterations and replay them, so that a GPU does not wait for Python; with rasterizer=warp. The bits stay.
-            None: on CUDA.
+        fused: "auto": one compiled pass corrects, merges, anchors and applies Adam where it can, and leaves out Gaussians that
+            would not change; "off": the same in torch operations, for reading.
+        replay: record iterations and replay them, so that a GPU does not wait for Python; needs rasterizer=warp. The result is
+            the same bit for bit. None: on CUDA.
         map_views: number of training views with maps of reliability and correction in maps/; 0: none.
         video: number of frames of path.mp4, a loop through the training cameras, 24 a second; 0: none.
         verbose: also show on the console the details that run.log holds; `-v` on the command line.
-        viewer: look at the field in the browser while it trains; the address is logged. Extra [view].
-        resume: a run's folder or one of its checkpoints: continue from there, bit for bit. auto: look into the run's own
-            folder. If the run is finished, train nothing; if it has checkpoints, continue from the newest one; else start
-            from the beginning.
-        overwrite: train even where a run has been in the folder, whose checkpoints and results are then removed. Else this is
-            refused, unless `resume` is set. Not with resume=auto, which experiments have.
-        device: cpu or cuda: where field, views and optimizer are. None: cuda if torch finds it and the rasterizer draws
-            there, else cpu. A run may be resumed on another device; its bits then differ.
+        viewer: open the viewer in the browser while the run trains; the address is logged. Needs the extra [view].
+        resume: a run's folder or one of its checkpoints, from which the run continues bit for bit. With "auto", the run's own
+            folder: if the run is finished, nothing is trained; if it has checkpoints, it continues from the newest one; else
+            it starts from the beginning.
+        overwrite: if there is a run in the folder already, remove its checkpoints and results, and train. If false, this is
+            refused, unless `resume` is set. Cannot be combined with resume="auto", which experiments set.
+        device: of field, views and optimizer, cpu or cuda. None: cuda if torch finds it and the rasterizer draws there, else
+            cpu. A run may be resumed on another device, but then gives other bits.
         threads: number of threads of torch and the kernels. None: all cores, divided by the jobs that run at once (joblib).
     """
 

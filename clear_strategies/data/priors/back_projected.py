@@ -25,7 +25,7 @@ class BackProjected:
 
     Args:
         prior: any other prior; a network is cached.
-        rounds: of back-projection, in [1, 100].
+        rounds: how often the difference to the LR photo is projected back, in [1, 100].
         down: D, the operator by which LR photos are made.
 
     Raises:

@@ -30,10 +30,10 @@ class SeededErrors:
     """Errors that are a function of (seed, name of the view).
 
     Args:
-        share: of the patches with errors, in [0, 1].
-        strength: of the errors, >= 0; 0: none.
+        share: share of the patches that get errors, in [0, 1].
+        strength: strength of the errors, >= 0; 0: none.
         patch: edge of a patch, HR px; 64 is the patch of P2G's reliability.
-        seed: of the errors; not the run's.
+        seed: seed of the errors, independent of the run's.
         hidden: keep only the part of the errors that the LR photo cannot show: reduced, wrong patches equal right ones, so
             that no comparison with the photo finds them.
 

@@ -81,7 +81,7 @@ def read(
         root: the folder; or one whose photos lie in its subfolder `images`, or in the only folder below it that holds any.
         cache: folder of the poses; None: ~/.cache/clear-strategies/sfm, or $CLEAR_CACHE/sfm. Not in the photos' folder.
         max_side: features are extracted from photos reduced to this many pixels.
-        max_features: of a photo, those of the coarsest scales; the time of matching grows with its square.
+        max_features: most features of a photo, of the coarsest scales; the time of matching grows with the square.
         precise: features that follow a surface's tilt (affine shape): more photos are placed, in about twice the time;
             "auto": for up to 30 photos.
         least_placed: the least share of the photos for which poses must be found.
