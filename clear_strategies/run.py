@@ -99,7 +99,7 @@ def _version() -> None:
 
 def _help() -> None:
     sys.stdout.write(
-        "clear-strategies COMMAND …; --help behind a command tells more.\n\n"
+        "clear-strategies COMMAND …, for photos and saved runs. COMMAND --help shows its arguments.\n\n"
         f"{_rows(COMMANDS)}\n"
         "clear-strategies setting=value …, for research: any strategies, data and settings, and sweeps.\n\n"
         f"{_rows(_RESEARCH)}"

@@ -48,7 +48,7 @@ def parser(module: str, description: str) -> argparse.ArgumentParser:
     """The parser of the program's options, by the names of `Settings`."""
     made = argparse.ArgumentParser(prog=f"python -m {module}", description=description)
     add = made.add_argument
-    add("--strategies", metavar="NAMES", help="of conf/strategy: clear, gco, gco,svs … (%(default)s)")
+    add("--strategies", metavar="NAMES", help="of conf/strategy: clear, gco, gco,svs … (default: %(default)s)")
     add(
         "--overrides", action="append", metavar="KEY=VALUE",
         help="e.g. strategies.gco.tolerance=0.1; repeatable",
@@ -56,16 +56,16 @@ def parser(module: str, description: str) -> argparse.ArgumentParser:
     add(
         "--points", metavar="own|stereo",
         help="what the Gaussians start from: the trainer's own points, or dense stereo between its training photos "
-        "(%(default)s)",
+        "(default: %(default)s)",
     )  # fmt: skip
     add("--sr", type=path_of, metavar="FOLDER", help="SR images, named like the photos")
     add("--suffix", help="what the SR tool appended to the names, e.g. _x4")
-    add("--factor", type=int, help="HR pixels per LR pixel (%(default)s)")
+    add("--factor", type=int, help="HR pixels per LR pixel (default: %(default)s)")
     add(
         "--save-lr", type=path_of, metavar="FOLDER",
         help="write the photos as they are trained on (reduced, masked) for an SR tool to enlarge; then stop",
     )  # fmt: skip
-    add("script", type=Path, help="the host's script")
+    add("script", type=Path, help="the trainer's script")
     add("rest", nargs=argparse.REMAINDER, help="the arguments of the script")
     made.set_defaults(**asdict(Settings()) | {"overrides": []})
     return made

@@ -1,4 +1,4 @@
-"""The command line of the benchmarks. A benchmark, QUESTION, is the module of its name; its options are defined here."""
+"""Measure time, memory and error on this machine. QUESTION names what is measured; QUESTION --help shows its options."""
 
 from __future__ import annotations
 

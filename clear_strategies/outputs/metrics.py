@@ -46,13 +46,13 @@ from rasterizers.native import threads
 _log = logging.getLogger(__name__)
 
 NOTE: Final = (
-    "bicubic and prior enlarge the photo of the view itself, which a run never sees of a test view, so they do not show "
-    "what can be learned from the other photos"
+    "bicubic and prior are the LR photo of the scored view itself, enlarged by interpolation and by the prior; a run does not "
+    "see the photos of test views"
 )
 
 _LEGEND: Final = (
-    "  Higher PSNR and SSIM are better, and lower GMSD, the error of edges. blur is above 0 where the picture is softer than "
-    "the photo, and below 0 where it is harder."
+    "  Higher PSNR and SSIM are better, and lower GMSD, the error of edges. A blur above 0 means that the picture is softer than "
+    "the photo, below 0 that it is sharper."
 )
 
 MOST_TRAIN: Final = 50  # largest number of training views that are scored, evenly spaced

@@ -85,14 +85,14 @@ def _quantities(table: pd.DataFrame) -> dict[str, tuple[str, str]]:
 
 def notes(table: pd.DataFrame, runs: Sequence[FinishedRun]) -> list[str]:
     """Notes for readers of the table."""
-    lines = [f"PSNR is also given of the enlarged LR photos (bicubic) and of the SR images (prior); {NOTE}."]
+    lines = [f"For comparison, {NOTE}."]
     if _differ(table):
         error = "; its ±: standard error of the differences seed by seed" * int(table["psnr_delta_error"].notna().any())
         references = " or ".join(f"`{method}`" for method in dict.fromkeys(table.loc[table["reference"], "method"]))
         lines.append(f"Δ: PSNR over the reference, {references}, dB{error}.")
         if _unpaired(table).any():
             why = "fewer than two seeds are common to both methods"
-            lines.append(f"Δ{_UNPAIRED}: {why}, so it is the difference of their means, and has no error.")
+            lines.append(f"Δ{_UNPAIRED}: {why}, so this is the difference of their means, without an error.")
     if table["psnr_best"].notna().any():
         lines.append("±: standard deviation over seeds; best: PSNR of the best seed.")
     if table["average"].any():

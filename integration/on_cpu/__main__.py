@@ -51,7 +51,7 @@ _RETURNS_INDICES: Final = re.compile(r"std::tuple|\w, *\w+ *= *distCUDA2\(")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a trainer on the CPU; returns the exit status."""
-    parser = launcher.parser("integration.on_cpu", "Run a trainer as it is, without a GPU.")
+    parser = launcher.parser("integration.on_cpu", "Run an unchanged trainer without a GPU, alone or with CLEAR.")
     parser.set_defaults(strategies=None)
     options = parser.parse_args(arguments)
     if options.strategies is None:

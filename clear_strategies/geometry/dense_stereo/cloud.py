@@ -71,7 +71,7 @@ def stereo_cloud(
     if not fill:
         return cloud
     added, shades = grid_points(cloud.means, photos, stride, background, maps)
-    source += f", less {len(means) - len(cloud.means):,} outliers, filled by {len(added):,} at completed depth"
+    source += f", less {len(means) - len(cloud.means):,} outliers, and {len(added):,} at completed depth"
     return PointCloud(torch.cat((cloud.means, added)), torch.cat((cloud.colors, shades)), source)
 
 
