@@ -43,11 +43,11 @@ class HostPhoto:
     """A training photo as its host trains on it.
 
     Args:
-        name: of its file, with the folder where the host has it.
+        name: name of the file, with the folder if the host has it.
         image: RGB in [0, 1] or 8 bits; further channels are left out.
         world_to_camera: OpenCV axes (x right, y down, z forward).
         K: focal lengths and principal point in pixels of `image`; pixel (0, 0) spans [0, 1)².
-        mask: by which the host's loss multiplies its rendering, in [0, 1]; None: nothing is hidden.
+        mask: in [0, 1]; the host's loss multiplies its rendering by it. None: nothing is hidden.
 
     Raises:
         DataError: one has another shape, or values outside of [0, 1]; or pose and K are no camera.

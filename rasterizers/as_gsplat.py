@@ -70,31 +70,36 @@ def rasterization(
     """Draw Gaussians as gsplat's `rasterization` does, by a backend of this package: pinhole cameras, any number of channels.
 
     Args:
-        means, quats, scales, opacities: of batches of scenes, or of one.
-        colors: with `sh_degree`, the active degree, spherical harmonics [*B, N, K, 3]; without it D channels [*B, N, D] in any
-            range. Either may be of each camera, [*B, C, N, …].
-        backgrounds: behind the image; with `sh_degree` each is a colour in [0, 1].
-        near_plane, far_plane: Gaussians beyond them are left out, and those whose radius is at most `radius_clip` px.
+        means, quats, scales, opacities: of one scene, or of batches of scenes.
+        colors: spherical harmonics [*B, N, K, 3] if `sh_degree`, the active degree, is given; else D channels [*B, N, D] in any
+            range. They may differ by camera, [*B, C, N, …].
+        backgrounds: the colours behind the images; in [0, 1] if `sh_degree` is given.
+        near_plane, far_plane: Gaussians that are not between them are left out.
+        radius_clip: Gaussians whose radius is at most this, px, are left out.
         render_mode: "RGB", "D" (accumulated depth), "ED" (expected depth), or both: "RGB+D", "RGB+ED". Depth is that of the
             centres along the camera's axis, the last channel, and has gradients.
-        packed: `info` is that of the visible Gaussians of each camera, one after the other. gsplat's default is True, and here
-            False, since on a CPU its ellipses take half as long as the image.
-        absgrad: after `backward()`, `info["means2d"].absgrad` is the sum over pixels of absolute gradients. Those of channels
-            that are not drawn together are summed apart.
+        packed: `info` lists the visible Gaussians only, camera by camera. gsplat's default is True. Here it is False, since on a
+            CPU the ellipses that it needs take half as long as the image.
+        absgrad: after `backward()`, `info["means2d"].absgrad` is the sum over pixels of absolute gradients. Channels that are not
+            drawn together are summed apart.
         more: gsplat's other arguments. Those that change only how it computes have no effect.
         backend: a name of `rasterizers.load`.
         rgb_offset: added to the colours before their clamp at 0, with `sh_degree` only; gsplat has no such argument.
-        replay: on CUDA with Warp, replay the kernels of drawings with gradients in place of launching each of them. The bits are
-            the same, but with `absgrad` nothing is replayed.
+        replay: on CUDA with Warp, replay recorded kernels of calls with gradients instead of launching each of them; the result
+            is the same bit for bit. With `absgrad`, nothing is replayed.
 
     Returns:
-        images, alphas, and `info`: `means2d` [*B, C, N, 2] (`retain_grad` works); `radii` [*B, C, N, 2] in pixels, `depths`,
-        `conics` and `opacities` of the visible, 0 of others, made when they are asked for, of the parameters as they are then;
-        and `width`, `height`, `n_cameras`, `n_batches`, `tile_size`. Packed, of M visible Gaussians: `means2d` [M, 2],
-        `gaussian_ids`, `camera_ids` and `batch_ids` [M], and in the graph of what they depend on, `depths` [M], `conics` [M, 3]
-        and `opacities` [M], times the factor of `rasterize_mode="antialiased"`; `radii` [M, 2] in pixels.
+        images, alphas, and `info`.
 
-        Gradients reach everything that is given but `Ks`. That of `viewmats` is exact along rigid motions.
+        `info` has `means2d` [*B, C, N, 2] (`retain_grad` works), `radii` [*B, C, N, 2] in pixels, `depths`, `conics`,
+        `opacities`, `width`, `height`, `n_cameras`, `n_batches` and `tile_size`. `radii`, `depths`, `conics` and `opacities` are
+        0 for invisible Gaussians; they are computed when they are read, from the parameters at that time.
+
+        With `packed`, for M visible Gaussians: `means2d` [M, 2], `gaussian_ids`, `camera_ids`, `batch_ids` [M], `radii` [M, 2] in
+        pixels, and, with gradients, `depths` [M], `conics` [M, 3] and `opacities` [M], times the factor of
+        `rasterize_mode="antialiased"`.
+
+        All arguments get gradients except `Ks`. That of `viewmats` is exact along rigid motions.
 
     Raises:
         ValueError: a mode or an argument that only gsplat supports, or a wrong shape.

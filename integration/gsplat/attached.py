@@ -46,9 +46,9 @@ class Attached:
     """The strategies of a conductor in a gsplat-style loop; `attach` makes one.
 
     Args:
-        params: gsplat's dict of leaves.
-        optimizers: a dict with one for each of them, or with others beside those that step the Gaussians; the loop may replace
-            them in it. Or a single optimizer.
+        params: gsplat's dict of parameters (leaf tensors).
+        optimizers: gsplat's dict with an optimizer for each parameter, or a single optimizer. The dict may hold others, too, and
+            the loop may replace its optimizers.
         views: all training views. A rendering belongs to the view named by `rendering`, or else to the view with its pose.
         strategy: gsplat's densification strategy, whose threshold scales P2G's score; None: a loop without one.
         state: the dict that records changes of structure, instead of `params`: the state of gsplat 1.4's strategy, or `signal`
@@ -58,13 +58,12 @@ class Attached:
         names: gsplat's parameter name -> the host's, where they differ (nerfstudio: sh0 is features_dc).
         loss_scale, accumulation: see `integration.host.Host`.
         masks: [h, w] by the name of a view, by which the host multiplies the LR image after rendering.
-        own_background: the loop adds a background to its renderings itself; otherwise strategies may choose the `backgrounds` of
-            calls that name none.
-        iterations: of the loop. A warning before the first step says if HR would take part only after them.
+        own_background: True if the loop adds a background to its renderings itself; otherwise strategies may choose the
+            `backgrounds` of calls that pass none.
+        iterations: length of the loop, for a warning if HR would take part only after its end.
         hr_by: what draws HR and extra views. "host": the wrapped function. A name of `rasterizers.load`: that rasterizer of this
-            package. "auto": on CUDA "warp", whose work is recorded and replayed, if the wrapped function is gsplat's or ours and
-            "warp" supports the call; otherwise "host". Pictures of the two differ by 3e-3 at most, where only one of them blends
-            a contribution of 1/255.
+            package. "auto": on CUDA "warp", whose work is replayed, if the wrapped function is gsplat's or ours and "warp"
+            supports the call; otherwise "host". Their images differ by at most 3e-3.
 
     Attributes:
         views: the argument.
