@@ -177,7 +177,7 @@ def within_limit(
         span = f"{max(ratios):.3g}" if max(ratios) == min(ratios) else f"{min(ratios):.3g} to {max(ratios):.3g}"
         why += f": photos reduced by {span} to {now.width}x{now.height} (PIL {views.downsample})"
     if not super_resolve:
-        why += "; they are the HR side, no SR image is needed, and LR is made from them"
+        why += "; the photos themselves are HR, so no SR image is needed, and LR is made from them"
         views = replace(views, photos_are="both")
     return _noted(capture, why), replace(views, shrink=1)
 
