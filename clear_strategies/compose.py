@@ -40,8 +40,8 @@ class ConductorSettings:
     """Settings of a conductor.
 
     Args:
-        strategies: by the names that the configuration gives them.
-        decorators: of the prior, by name; each takes a prior and returns one.
+        strategies: the strategies, by the names that the configuration gives them.
+        decorators: functions that take a prior and return one, by name, such as back_projected.
         statistics_from: the iteration from which densification reads the HR render, a milestone; see `Conductor`.
     """
 

@@ -32,11 +32,16 @@ class RasterizerSettings:
 
     Args:
         name: auto, or a name of `rasterizers.names`.
-        preset: cut-offs by name, see `rasterizers.PRESETS`; alpha_min and transmittance_min win over it.
-        kernel, near, alpha_min, alpha_max, transmittance_min, antialiased: see `RasterSettings`.
+        preset: fast, accurate or exact: sets alpha_min and transmittance_min where these are None. None: the backend's.
+        kernel: variance of the 2D Mip kernel, px².
+        near: smallest depth at which a Gaussian is drawn, world units.
+        alpha_min: a contribution below it is not blended; None: by the preset.
+        alpha_max: cap on a single contribution, in (0, 1).
+        transmittance_min: a pixel ends before its transmittance falls below it; None: by the preset.
+        antialiased: scale the opacity to make up for the blur of the 2D kernel (Mip-Splatting).
         background: RGB in [0, 1]; None: that of the data set.
         memory: MiB that the lists of one image may take (cpp, warp).
-        threads: of the kernels (cpp); None: as many as torch has.
+        threads: number of threads of the kernels (cpp); None: as many as torch has.
         isa: instruction set of the kernels (cpp): avx512, avx2 or baseline; None: the fastest of this processor.
         lanes: pixel-Gaussian pairs that are blended at a time (torch).
         device: cpu or cuda (warp); None: that of the job.

@@ -34,7 +34,8 @@ class SRStage(Strategy):
     Args:
         start: the last iteration of the first stage.
         count: number of pictures from cameras beside the training cameras, at least 0.
-        reach: as that of `PseudoViews`, as a multiple of a camera's distance from the middle of the Gaussians.
+        reach: largest distance of such a camera from its training camera, as a multiple of the training camera's distance from
+            the middle of the Gaussians.
         weight: weight of the loss of an HR picture, > 0, as a multiple of a photo's LR loss.
 
     Raises:

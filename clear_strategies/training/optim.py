@@ -32,7 +32,7 @@ class LearningRates:
     Args:
         means: log-linear decay, in units of the scene's extent.
         quats, scales, opacities, sh0, shN: of the raw parameters (any norm, log, logit, SH coefficients).
-        detail, detail_steps, detail_decay: of f_det: rate, steps and decay of `DetailRates`.
+        detail, detail_steps, detail_decay: the rate, steps and decay of f_det, see `DetailRates`.
         geometry_steps: the iterations that the rates of means, scales and quats are for. In a run of T < geometry_steps
             these are (geometry_steps / T)^(1/3) times as high, see `of_run`; 0: as they stand in a run of any length.
         cool_from, end: between these iterations all rates fall linearly to 0, except for that of the means, which always falls.

@@ -19,7 +19,7 @@ class FitSettings:
     Args:
         iterations: optimizer steps, one view each.
         scale_schedule: stretch every milestone from 10,000 iterations to `iterations`.
-        seed: of all random numbers, such as the order of views, dropout and splits; 64 bits with sign.
+        seed: seed of all random numbers, such as the order of views, dropout and splits; 64 bits with sign.
         max_degree: the highest degree of the spherical harmonics, 0 to 3.
         degree_every: iterations after which the next degree is trained, too.
         probe_every: iterations between evaluations of the test views; 0: never.
@@ -41,8 +41,8 @@ class FitSettings:
             it starts from the beginning.
         overwrite: if there is a run in the folder already, remove its checkpoints and results, and train. If false, this is
             refused, unless `resume` is set. Cannot be combined with resume="auto", which experiments set.
-        device: of field, views and optimizer, cpu or cuda. None: cuda if torch finds it and the rasterizer draws there, else
-            cpu. A run may be resumed on another device, but then gives other bits.
+        device: where field, views and optimizer are, cpu or cuda. None: cuda if torch finds it and the rasterizer draws there,
+            else cpu. A run may be resumed on another device, but then gives other bits.
         threads: number of threads of torch and the kernels. None: all cores, divided by the jobs that run at once (joblib).
     """
 

@@ -85,8 +85,9 @@ def read(
         precise: features that follow a surface's tilt (affine shape): more photos are placed, in about twice the time;
             "auto": for up to 30 photos.
         least_placed: the least share of the photos for which poses must be found.
-        threads: of COLMAP; -1: all. With more than one, the poses' last digits may change from run to run.
-        seed: of COLMAP's random samples.
+        threads: number of threads of COLMAP; -1: all cores. With more than one, the poses' last digits may change from run to
+            run.
+        seed: seed of COLMAP's random samples.
         skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
 
     Raises:
