@@ -34,12 +34,13 @@ def drawn(function, splats, camera, sh_fp16=False, **settings):
 
 
 class Host:
-    """Parameters, optimizers and LR photos (name -> camera and image) of a gsplat-style trainer."""
+    """Parameters, optimizers and LR photos (name -> camera and image) of a gsplat-style trainer, by default of the toy scene."""
 
     def __init__(
-        self, scene, extent=1.0, strategy=None, accumulation=1, eps=1e-15, rasterization=rasterization, **call
+        self, scene=None, extent=1.0, strategy=None, accumulation=1, eps=1e-15, rasterization=rasterization, **call
     ):
         self.rasterization, self.call = rasterization, {"packed": False, **call}
+        self.scene = scene = scene or toy.scene(20)
         self.photos = {v.name: v.lr for v in scene.train}
         raw = GaussianField.from_cloud(scene.cloud).raw()
         device = scene.train[0].lr.image.device
@@ -107,8 +108,8 @@ def trained(host: Host, scene, conductor: Conductor, names, /, **settings) -> At
 
 def started(*strategies, conductor=None, host=None, scene=None, **settings):
     """A host on the toy scene, CLEAR in its loop, by default with HR from the start, and a function that renders its photo i."""
-    scene = scene or toy.scene(20)
     host = host or Host(scene)
+    scene = scene or host.scene
     clear = attached(host, scene, conductor or Conductor(*strategies, objective=HR_FROM_START), **settings)
 
     def render(i=0, **call):

@@ -91,7 +91,7 @@ def test_accumulated_passes_are_one_step_with_one_extra_step(drawn):
 
 def stepped(make, scaler=None):
     """The parameters after a step by the optimizers that `make` gives for them, and how many extra steps were counted."""
-    trainer = Host(toy.scene(20))
+    trainer = Host()
     trainer.optimizers = make(trainer.splats)
     loss_scale = None if scaler is None else scaler.get_scale
     _, clear, render = started(toy.ShowsDark(), host=trainer, detail=False, loss_scale=loss_scale)
@@ -116,7 +116,7 @@ def test_an_adam_of_all_parameters_makes_one_extra_step_which_a_scaler_of_losses
 
 
 def test_a_step_on_an_extra_view_moves_the_gaussians_alone_and_leaves_gradients_to_the_loop():
-    trainer, exposure = Host(toy.scene(20)), torch.nn.Parameter(torch.ones(1))
+    trainer, exposure = Host(), torch.nn.Parameter(torch.ones(1))
     one = torch.optim.SGD([*trainer.splats.values(), exposure], lr=0.5)
     trainer.optimizers = {"all": one}
     _, clear, render = started(toy.ShowsDark(), host=trainer)
@@ -189,7 +189,7 @@ def test_an_adam_of_visible_gaussians_steps_all_of_them_on_an_extra_view(step):
     def recorded(self, *args, **kwargs):
         calls.append((*args, *kwargs.values()))
 
-    selective, trainer = type("Selective", (torch.optim.Adam,), {"step": recorded}), Host(toy.scene(20))
+    selective, trainer = type("Selective", (torch.optim.Adam,), {"step": recorded}), Host()
     trainer.optimizers = {name: selective([p]) for name, p in trainer.splats.items()}
     started(toy.ShowsDark(), host=trainer)[2]().mean().backward()
     everyone = torch.ones(20, dtype=torch.bool), 20
@@ -201,7 +201,7 @@ def test_an_adam_of_visible_gaussians_steps_all_of_them_on_an_extra_view(step):
 
 def test_an_optimizer_that_needs_something_else_to_step_on_an_extra_view_is_refused():
     """As that of hierarchical 3DGS, which takes indices of Gaussians."""
-    trainer = Host(toy.scene(20))
+    trainer = Host()
     other = type("Other", (torch.optim.Adam,), {"step": lambda self, relevant, closure=None: None})
     trainer.optimizers = {name: other([p]) for name, p in trainer.splats.items()}
     started(toy.ShowsDark(), host=trainer)[2]().mean().backward()

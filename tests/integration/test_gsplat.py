@@ -123,7 +123,7 @@ def test_splats_are_attached_once_at_a_time():
 @pytest.mark.parametrize("another", [lambda c: c, lambda c: Conductor(*c.strategies, objective=c.objective)])
 def test_a_strategy_trains_one_loop_at_a_time(another):
     """It would mix what it knows of two scenes, whose photos may have the same names."""
-    scene, first, second = toy.scene(20), Host(toy.scene(20)), Host(toy.scene(20))
+    scene, first, second = toy.scene(20), Host(), Host()
     conductor = Conductor(P2G(patch=4), objective=HR_FROM_START)
     clear, _ = attached(first, scene, conductor), attached(second, scene, goes_on := another(conductor))
     camera = scene.train[0].lr.camera
@@ -157,10 +157,9 @@ def with_info(change):
 
 def test_a_renderer_without_projected_centres_and_radii_of_gsplat_1_4_are_supported():
     """The renderer of gsplat's 3DGUT (with_ut, with_eval3d) has no gradient of the projected centres."""
-    scene = toy.scene(20)
-    host = Host(scene, rasterization=with_info(lambda info: {"means2d": info["means2d"].detach()}))
+    host = Host(rasterization=with_info(lambda info: {"means2d": info["means2d"].detach()}))
     conductor = Conductor(*all_three(), objective=HR_FROM_START)
-    clear = trained(host, scene, conductor, [v.name for v in scene.train])
+    clear = trained(host, host.scene, conductor, [v.name for v in host.scene.train])
     assert clear.attachment.counts["merges"] == 3
     assert float(host.splats["detail"].abs().max()) > 0
     of_1_4 = with_info(lambda info: {"radii": info["radii"][..., 0]})
@@ -212,18 +211,17 @@ def test_what_cannot_be_attached_or_drawn_is_refused():
 
 def test_parameters_that_are_computed_from_others_are_refused():
     """Their gradient would be lost: torch gives it to the leaves."""
-    scene = toy.scene(20)
-    host = Host(scene)
+    host = Host()
     colors = torch.nn.Parameter(torch.cat((host.splats["sh0"], host.splats["shN"]), 1).detach())
     slices = {**host.splats, "sh0": colors[:, :1], "shN": colors[:, 1:]}
     with pytest.raises(HostError, match=r"sh0 must be a leaf.*a Parameter of its own"):
-        attach(slices, host.optimizers, scene.train, Conductor())
+        attach(slices, host.optimizers, host.scene.train, Conductor())
     model = torch.nn.Module()
     model.splats = torch.nn.ParameterDict(host.splats)
-    clear = attach(model.splats, host.optimizers, scene.train, Conductor())
+    clear = attach(model.splats, host.optimizers, host.scene.train, Conductor())
     host.rasterization = clear.wrap(host.rasterization)
     model.forward = lambda camera: drawn(host.rasterization, model.splats, camera)[0].mean()
-    camera = (scene.train[0].lr.camera,)
+    camera = (host.scene.train[0].lr.camera,)
     torch.func.functional_call(model, dict(model.named_parameters()), camera).backward()
     assert clear.attachment.counts["merges"] == 1
     with pytest.raises(HostError, match="means must be a leaf"):
@@ -261,8 +259,7 @@ def test_renderings_are_freed_after_their_step_and_with_the_loop(last_one_has_ba
 
 
 def test_the_detail_feature_of_a_checkpoint_is_trained():
-    scene = toy.scene(20)
-    host = Host(scene)
+    host = Host()
     host.splats["detail"] = torch.nn.Parameter(torch.zeros(20, 3))  # as a checkpoint of the host holds it
-    trained(host, scene, Conductor(P2G(), objective=HR_FROM_START), [v.name for v in scene.train])
+    trained(host, host.scene, Conductor(P2G(), objective=HR_FROM_START), [v.name for v in host.scene.train])
     assert float(host.splats["detail"].abs().max()) > 0

@@ -52,7 +52,7 @@ def test_hr_has_what_a_partial_presets():
     found = []
     for preset, named in ((given, {}), ({}, given)):
         function = functools.partial(rasterizers.rasterization, backend="torch", **preset)
-        host, _, render = started(P2G(patch=4), host=Host(toy.scene(20), rasterization=function), hr_by="torch")
+        host, _, render = started(P2G(patch=4), host=Host(rasterization=function), hr_by="torch")
         render(**named).mean().backward()
         found.append([host.splats[name].grad for name in ("means", "scales", "sh0", "opacities")])
     assert all(map(torch.equal, *found))
@@ -381,7 +381,7 @@ def test_what_is_computed_between_photos_is_refused_for_other_than_pinhole_camer
     def function(*args, camera_model="pinhole", radial_coeffs=None, **kwargs):
         return gsplat_host.rasterization(*args, **kwargs)
 
-    _, _, render = started(*strategies, host=Host(toy.scene(20), rasterization=function))
+    _, _, render = started(*strategies, host=Host(rasterization=function))
     message = f"PseudoViews must have pinhole cameras, got {refused}"
     with pytest.raises(HostError, match=message) if refused else nullcontext():
         render(**more)
@@ -395,7 +395,7 @@ def watched(look):
         look(call)
         return gsplat_host.rasterization(**call)
 
-    return Host(toy.scene(20), rasterization=function)
+    return Host(rasterization=function)
 
 
 def test_random_numbers_inside_of_the_hosts_function_are_the_same_in_all_renderings_of_a_step_and_as_without_clear():
@@ -422,7 +422,7 @@ def test_the_gated_opacities_of_a_step_are_not_kept_with_their_graph():
 
 
 def test_the_detail_feature_has_the_type_of_what_is_drawn():
-    host = Host(toy.scene(20))
+    host = Host()
     host.splats["means"] = torch.nn.Parameter(host.splats["means"].detach().double())
     _, clear, _ = started(host=host)
     drawn = {**host.splats, "means": host.splats["means"].float()}
@@ -481,7 +481,7 @@ def test_a_densifier_sees_no_radius_of_gaussians_that_the_gate_drops():
         renders, alphas, info = FUNCTIONS["another"](**call)
         return renders, alphas, info | {"radii": torch.ones_like(info["radii"])}
 
-    host, clear, _ = started(SVS(looks=0, dropout=Ramp(full=1)), host=Host(toy.scene(20), rasterization=of_1_4))
+    host, clear, _ = started(SVS(looks=0, dropout=Ramp(full=1)), host=Host(rasterization=of_1_4))
     _, _, info = host.render(host.photos["view0"].camera)
     dropped = clear.attachment.conductor.gate(1, 20) == 0
     assert 0 < int(dropped.sum()) < 20
@@ -550,7 +550,7 @@ def test_functions_that_are_wrapped_one_after_the_other_get_their_own_arguments(
         given = means, quats, scales, opacities, colors, viewmats, Ks, width, height
         return gsplat_host.rasterization(*given, sh_degree=sh_degree, render_mode=render_mode)
 
-    _, clear, render = started(host=Host(toy.scene(20), rasterization=theirs))
+    _, clear, render = started(host=Host(rasterization=theirs))
     clear.wrap(autograd.rasterization)  # which takes an offset of the colours
     render().mean().backward()
     assert clear.attachment.counts["merges"] == 1
@@ -594,7 +594,7 @@ ORDERS = {
 @pytest.mark.parametrize("function", FUNCTIONS)
 @needs("cpp")
 def test_gaussians_in_another_order_than_the_parameters_are_refused(order, function):
-    host, _, _ = started(host=Host(toy.scene(20), rasterization=FUNCTIONS[function]))
+    host, _, _ = started(host=Host(rasterization=FUNCTIONS[function]))
     for name in ("scales", "sh0"):  # as a loop that makes all of its tensors anew has them
         host.splats[name].data += torch.rand_like(host.splats[name])
     draw = lambda *x, **call: host.rasterization(*map(ORDERS[order], x[:5]), *x[5:], **call)  # noqa: E731
@@ -611,7 +611,7 @@ def test_gaussians_in_another_order_than_the_parameters_are_refused(order, funct
 @needs("cpp")
 def test_gaussians_that_are_looked_at_have_their_own_detail_feature_in_any_order_part_or_batch(function, grad):
     """As a viewer draws them that sorts or crops: from a pose of no photo, or without gradients."""
-    host, _, _ = started(host=Host(toy.scene(20), rasterization=FUNCTIONS[function]))
+    host, _, _ = started(host=Host(rasterization=FUNCTIONS[function]))
     plain, camera = FUNCTIONS[function], toy.camera(0.05)
     splats = {name: p.detach() for name, p in host.splats.items()}
     splats["detail"][:] = torch.rand(20, 3)
@@ -641,7 +641,7 @@ def test_gaussians_that_are_looked_at_have_their_own_detail_feature_in_any_order
 
 
 def test_batches_of_scenes_are_looked_at_with_the_detail_feature_and_refused_as_a_photo():
-    host, _, _ = started(host=Host(toy.scene(20), rasterization=autograd.rasterization))
+    host, _, _ = started(host=Host(rasterization=autograd.rasterization))
     host.splats["detail"].data += 0.2
     camera = host.photos["view0"].camera
 

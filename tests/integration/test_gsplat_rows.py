@@ -131,10 +131,9 @@ def test_the_signals_of_a_scene_carry_the_rows_and_may_change_in_place():
 
 
 def test_checkpoints_and_later_loops_know_nothing_of_the_rows():
-    scene = toy.scene(20)
-    host = Host(scene)
+    host = Host()
     splats = torch.nn.ParameterDict(host.splats)
-    clear = attach(splats, host.optimizers, scene.train, Conductor())
+    clear = attach(splats, host.optimizers, host.scene.train, Conductor())
     assert ROWS in splats
     stored = {name: p.clone() + 1 for name, p in splats.state_dict().items()}
     assert set(stored) == {*host.splats, "detail"}

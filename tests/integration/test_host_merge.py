@@ -314,7 +314,7 @@ def test_on_a_device_nothing_is_read():
 def test_parameters_whose_columns_lie_together_have_the_same_merged_gradients():
     grads = []
     for strided in (False, True):
-        host = gsplat_host.Host(toy.scene(20))
+        host = gsplat_host.Host()
         for name in ("means", "quats", "scales"):
             rows = host.splats[name].detach() + torch.linspace(0, 0.5, host.splats[name].shape[1])
             host.splats[name] = torch.nn.Parameter(rows.t().contiguous().t() if strided else rows)

@@ -147,11 +147,10 @@ def test_an_optimizer_that_calls_its_closure_several_times_is_refused():
 
 @pytest.mark.parametrize("form", ["alone", "in a dictionary", "of the means alone"])
 def test_f_det_is_a_group_of_the_only_optimizer_of_several_parameters_else_it_has_one_of_its_own(form):
-    scene = toy.scene(20)
-    host = Host(scene)
+    host = Host()
     only = torch.optim.Adam([host.splats["means"]] if form == "of the means alone" else [*host.splats.values()], **ADAM)
     optimizers = only if form == "alone" else {"first": only}
-    attach(host.splats, optimizers, scene.train, Conductor())
+    attach(host.splats, optimizers, host.scene.train, Conductor())
     stepping = only if form == "alone" else optimizers["detail"]  # where gsplat's densifiers look for it
     assert (stepping is only) == (form != "of the means alone")
     group = stepping.param_groups[-1]
@@ -160,13 +159,12 @@ def test_f_det_is_a_group_of_the_only_optimizer_of_several_parameters_else_it_ha
 
 
 def test_f_det_is_no_group_of_an_optimizer_whose_scheduler_counts_the_groups():
-    scene = toy.scene(20)
-    host = Host(scene)
+    host = Host()
     only = torch.optim.Adam([*host.splats.values()], **ADAM)
     schedule = torch.optim.lr_scheduler.LambdaLR(only, lambda _: 1.0)
     with pytest.raises(SettingError, match=r"Make the scheduler after attach\(\)"):
-        attach(host.splats, only, scene.train, Conductor())
-    attach(host.splats, only, scene.train, Conductor(), detail=False)
+        attach(host.splats, only, host.scene.train, Conductor())
+    attach(host.splats, only, host.scene.train, Conductor(), detail=False)
     schedule.step()
 
 
@@ -215,7 +213,7 @@ def test_a_step_without_a_strategy_is_refused_at_first_and_told_later_with_its_c
 @pytest.mark.parametrize(("backwards", "accumulation", "told"), [(2, 1, 1), (1, 1, 0), (2, 2, 0), (3, 2, 1)])
 def test_more_backward_passes_than_accumulation_names_are_told_once(backwards, accumulation, told, caplog):
     """Each would bring the whole HR gradient."""
-    host = Host(toy.scene(20), accumulation=backwards)
+    host = Host(accumulation=backwards)
     started(host=host, conductor=Conductor(), accumulation=accumulation)
     host.train(["view0"] * 3 * backwards)
     assert caplog.text.count(f"but accumulation={accumulation}. If the loop divides each loss") == told
@@ -236,10 +234,9 @@ class Descent:
     ],
 )
 def test_optimizers_that_f_det_cannot_join_are_refused(optimizers, rule):
-    scene = toy.scene(20)
-    host = Host(scene)
+    host = Host()
     with pytest.raises(SettingError, match=rule):
-        attach(host.splats, optimizers(host), scene.train, Conductor())
+        attach(host.splats, optimizers(host), host.scene.train, Conductor())
 
 
 def test_a_step_begins_after_each_merge_whichever_optimizers_take_part():
@@ -361,16 +358,11 @@ def test_the_densifier_reads_a_score_that_has_the_scale_of_its_own_gradients(acc
     """As `unscale_` and its mean over the passes expect it."""
     read = []
     for scale, passes in ((1.0, 1), (64.0, accumulation)):
-        scene = toy.scene(20)
-        host = Host(scene)
-        clear = attach(
-            host.splats, host.optimizers, scene.train, Conductor(P2G(patch=4), objective=HR_FROM_START),
-            strategy=SimpleNamespace(refine_stop_iter=0, grow_grad2d=1e-4), loss_scale=lambda scale=scale: scale,
-            accumulation=passes,
-        )  # fmt: skip
-        host.rasterization = clear.wrap(host.rasterization)
-        renders, _, info = host.render(scene.train[0].lr.camera, 3)
-        (scale / passes * photometric(renders[0], scene.train[0].lr.image)).backward()
+        strategy, settings = SimpleNamespace(refine_stop_iter=0, grow_grad2d=1e-4), {"accumulation": passes}
+        host, clear, _ = started(P2G(patch=4), strategy=strategy, loss_scale=lambda scale=scale: scale, **settings)
+        photo = host.photos["view0"]
+        renders, _, info = host.render(photo.camera, 3)
+        (scale / passes * photometric(renders[0], photo.image)).backward()
         assert clear.attachment.counts["scores written"] == 1
         read.append(info["means2d"].grad * passes / scale)
     assert bool(read[0].any())
@@ -438,7 +430,7 @@ def test_a_loop_that_steps_by_hand_over_one_view_goes_on(optimizers):
     """The first pass alone may be that of SAM, whose step is still to come."""
 
     def begun():
-        host = Host(toy.scene(20))
+        host = Host()
         host.optimizers = host.optimizers if optimizers else {}
         return started(host=host)
 
@@ -533,7 +525,7 @@ def test_hr_is_left_out_of_every_second_step_but_where_a_densifier_reads_its_sco
         widths.add(call["width"])
         return gsplat_host.rasterization(**call)
 
-    host = Host(toy.scene(20), rasterization=recorded)
+    host = Host(rasterization=recorded)
     strategies = P2G(patch=4), SVS(anchor_start=anchor_start)
     conductor = Conductor(*strategies, objective=HR_FROM_START, skips=Skips(coarse_until=100, hr_every=2))
     strategy = SimpleNamespace(refine_stop_iter=0, grow_grad2d=threshold)

@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import operator
 import pickle
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -297,6 +298,14 @@ def test_a_parameter_that_after_step_gives_other_memory_is_refused_in_a_run(chan
         made.after_step({"means": torch.ones(8, 3)}, toy.step())
 
 
+def test_a_parameter_that_is_replaced_in_place_of_changed_is_refused():
+    made = Conductor(
+        answering("after_step", lambda params, step: operator.setitem(params, "means", 2 * params["means"]))()
+    )
+    with pytest.raises(TypeError, match="does not support item assignment"):
+        made.after_step({"means": torch.ones(1, 3)}, toy.step())
+
+
 class OfOnesOwn(Strategy):
     def __init__(self):
         """That of the dataclass makes `state`."""
@@ -394,15 +403,6 @@ def test_what_two_strategies_of_one_class_log_and_add_is_both_there_until_the_ne
     assert not conductor.logs.scalars()
     with pytest.raises(AnswerError, match=r"LogsShare.log\('share', …\) takes one number, got a tensor \[2\]"):
         LogsShare(torch.ones(2)).regularize({}, 1)
-
-
-def test_a_parameter_that_is_replaced_in_place_of_changed_is_refused():
-    class Replaces(Strategy):
-        def after_step(self, params, step):
-            params["means"] = params["means"] * 2
-
-    with pytest.raises(TypeError, match="does not support item assignment"):
-        Conductor(Replaces()).after_step({"means": torch.ones(1, 3)}, toy.step())
 
 
 def test_the_contract_shows_poses_in_the_type_that_the_readers_give_them():
@@ -687,9 +687,8 @@ def test_a_reduced_lr_image_counts_for_densification_in_ndc_as_a_drawn_one_does(
 
 def test_without_lr_photos_only_the_reference_moves_gaussians(drawn):
     field, view, _, hr = drawn
-    conductor = Conductor(objective=Objective(lambda_hr=ALWAYS, lambda_hf=0.0, lambda_lr=0.0))
-    update = conductor.update(field.raw(), None, hr, view, 5)
-    (g_base,) = hr.vjp(conductor.objective.hr(hr.image, view.hr.image).cotangents)
+    update = updated((field, view, None, hr), lambda_hf=0.0, lambda_lr=0.0)
+    (g_base,) = hr.vjp(Objective(lambda_hr=ALWAYS, lambda_hf=0.0).hr(hr.image, view.hr.image).cotangents)
     for name in ("means", "quats", "scales", "opacities", "sh0"):
         assert torch.allclose(update.grads[name], g_base[name], rtol=1e-12, atol=0)
     assert update.losses["lr"] > 0  # measured, for the log
@@ -802,18 +801,12 @@ def test_two_strategies_of_one_class_keep_their_states_apart():
 
 def test_comparisons_change_the_image_and_add_losses_each_around_the_next(drawn):
     """As one objective of both would: what comes first sees the render, and what follows sees what that passes on."""
-    field, view, lr, hr = drawn
-    objective = Objective(lambda_hr=ALWAYS)
-
-    def update(*strategies):
-        conductor = Conductor(*strategies, objective=objective)
-        conductor.on_fit_start(1, 0, views=[view])
-        return conductor.update(field.raw(), lr, hr, view, 5)
-
+    _, view, lr, hr = drawn
     plain, darker, outside, inside = (
-        update(*strategies) for strategies in ((), (Darker(),), (Brightness(), Darker()), (Darker(), Brightness()))
+        updated(drawn, *strategies)
+        for strategies in ((), (Darker(),), (Brightness(), Darker()), (Darker(), Brightness()))
     )
-    dark = objective.lr(lr.image * 0.5, view.lr.image)
+    dark = Objective(lambda_hr=ALWAYS).lr(lr.image * 0.5, view.lr.image)
     assert darker.losses["lr"] == pytest.approx(dark.values["lr"])
     torch.testing.assert_close(darker.cotangents_lr, dark.cotangents * 0.5)
     assert plain.losses["lr"] != darker.losses["lr"] == outside.losses["lr"] == inside.losses["lr"]
@@ -840,7 +833,6 @@ def test_cotangents_that_a_strategy_stores_are_its_own(drawn):
 
 
 def test_a_comparison_must_pass_on_the_losses_of_one_image(drawn):
-    field, view, lr, hr = drawn
     twice = "must call losses.image. once, but calls it again"
     faults = {
         "must give the Losses that losses": lambda scale, image, photo, step, losses: losses(image).values,
@@ -851,9 +843,8 @@ def test_a_comparison_must_pass_on_the_losses_of_one_image(drawn):
         )._replace(cotangents=torch.zeros(3, *image.shape)),
     }
     for message, compare in faults.items():
-        conductor = Conductor(answering("compare", compare)(), objective=Objective(lambda_hr=ALWAYS))
         with pytest.raises(AnswerError, match=rf"compare\(\) {message}"):
-            conductor.update(field.raw(), lr, hr, view, 5)
+            updated(drawn, answering("compare", compare)())
 
 
 def test_tensors_of_the_run_have_any_shape_stay_when_the_structure_changes_and_are_given_back():
