@@ -36,7 +36,8 @@ class ViewSettings:
         test_limit: at most this many test views, evenly spaced; None: all.
         sr_scale: HR pixels per LR pixel, at most: see `max_hr_megapixels`.
         max_hr_megapixels: the largest HR image with photos_are=lr. If sr_scale times the photos are larger, HR is twice as large
-            as the photos, or the photos themselves, reduced to this size, are HR. None: no limit.
+            as the photos, or the photos themselves, reduced to this size, are HR; with a prior chosen by name, the photos are
+            reduced instead, until sr_scale times them fits. None: no limit.
         shrink: the photos are first reduced by this whole factor (LLFF at 1/8 and 1/2 of its full size: 2).
         sizes: what happens to photos whose sizes are no multiples of shrink · sr_scale. "crop": they lose a few pixels
             at the right and the bottom. "round": they are resized to sr_scale · round(size / (shrink · sr_scale)).

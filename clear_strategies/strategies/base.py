@@ -70,7 +70,7 @@ class Strategy:
 
     Args:
         state: tensors [N, …] with a row for each Gaussian, which `on_resize` gathers, and scalar tensors. Checkpoints save them.
-        run_state: tensors of any other shape, such as parameters for each view. Checkpoints save them.
+        run_state: other tensors, of any shape, such as parameters for each view. Checkpoints save them.
         cache: values that can be computed again (patch maps, keyed by view); never saved.
         logs: scalars of this iteration, see `log`.
         of_run: device, seed, λ_HR and activations of the run; all strategies of a run share the object.

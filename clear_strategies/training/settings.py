@@ -19,7 +19,7 @@ class FitSettings:
     Args:
         iterations: optimizer steps, one view each.
         scale_schedule: stretch every milestone from 10,000 iterations to `iterations`.
-        seed: seed of all random numbers, such as the order of views, dropout and splits; 64 bits with sign.
+        seed: seed of the run's random numbers, such as the order of views, dropout and splits; 64 bits with sign.
         max_degree: the highest degree of the spherical harmonics, 0 to 3.
         degree_every: iterations after which the next degree is trained, too.
         probe_every: iterations between evaluations of the test views; 0: never.
