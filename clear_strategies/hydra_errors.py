@@ -105,7 +105,8 @@ def _no_setting(key: str, overrides: Sequence[str], config: str) -> str:
     if (CONF / key).is_dir():
         return f"no choice of this group is there to be replaced, so it is added: +{key}={value or '…'}."
     others, group = [o for o in overrides if key_of(o) != key], key.partition(".")[0]
-    for choice in (group, *["protocol"] * (group == "data")):  # a protocol's scenes have data.root
+    own = f"{key.rpartition('.')[0]}.{TARGET}" in map(key_of, overrides)  # a class of the user's in place of an option
+    for choice in () if own else (group, *["protocol"] * (group == "data")):  # a protocol's scenes have data.root
         plus = "+" * (choice == "protocol")
         having = [f"{plus}{choice}={option}" for option in options(choice) if has_setting(choice, option, key)]
         if having and key in flat(_composed([*others, having[0]], config)):  # else another of the group is chosen

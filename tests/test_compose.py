@@ -1,6 +1,7 @@
 """From conf/ to objects: names on the command line, the defaults' one owner, and what is refused."""
 
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -91,8 +92,10 @@ def test_a_list_of_settings_is_refused_with_the_remedy(tmp_path):
 
 def test_a_setting_of_a_class_that_a_sweep_leaves_in_place_is_added_by_a_plus():
     words = ["experiment=llff_x4", f"+strategies.x._target_={MINE}", "strategies.x.share=1"]
-    with pytest.raises(SettingError, match=r"a plus adds it: \+strategies\.x\.share="):
-        compose_module.composed(words, "config")
+    of_a_prior = ["prior._target_=clear_strategies.data.priors.Onnx", "prior.path=a.onnx"]  # options have a path, too
+    for given, key in ((words, "strategies.x.share"), (of_a_prior, "prior.path")):
+        with pytest.raises(SettingError, match=rf"a plus adds it: \+{re.escape(key)}="):
+            compose_module.composed(given, "config")
     for key in ("strategies.x.share", "data.reader.share"):
         unknown = ConfigCompositionException(f"Could not override '{key}'.")
         from_a_folder = ["data=only_in_a_folder_of_config_dir", "+strategy=x", f"{key}=1"]
