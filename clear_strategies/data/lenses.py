@@ -39,7 +39,9 @@ CUT: Final = (
     "ns-process-data images --camera-type equirectangular --data images --output-dir flat"
 )
 """The remedy for panoramas of 360 degrees."""
-_BORDER_SAMPLES: Final = 33
+_SAMPLES: Final = 65  # a side
+_MOST_ZOOM: Final = 2.0  # of OpenCV's pinhole
+_ZOOMS: Final = 36
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,25 +177,29 @@ def _filled_pinhole(lens: Lens) -> Lens | None:
     fx, fy, cx, cy = (float(x) for x in (new[0, 0], new[1, 1], new[0, 2] + 0.5, new[1, 2] + 0.5))
     if not (all(map(math.isfinite, (cx, cy))) and 0.1 < fx / lens.fx < 10 and 0.1 < fy / lens.fy < 10):
         return None
-    pinhole = Lens(lens.width, lens.height, fx, fy, cx, cy)
-    return pinhole if _covers(lens, pinhole) else None
+    # OpenCV returns K itself, or a view that is too wide, if it cannot invert the lens up to the corners.
+    zoomed = (Lens(*size, zoom * fx, zoom * fy, cx, cy) for zoom in np.geomspace(1.0, _MOST_ZOOM, _ZOOMS))
+    return next((pinhole for pinhole in zoomed if _covers(lens, pinhole)), None)
 
 
 def _covers(lens: Lens, pinhole: Lens) -> bool:
-    """Return True if the border of the undistorted image lies inside the distorted one, up to OpenCV's approximation."""
+    """Return True if the undistorted image lies inside the distorted one, up to OpenCV's approximation, and is not folded."""
     import cv2
 
-    t = np.linspace(0, 1, _BORDER_SAMPLES)
-    zero, one = np.zeros_like(t), np.ones_like(t)
-    border = np.concatenate([np.stack(side, 1) for side in ((t, zero), (t, one), (zero, t), (one, t))])
-    rays = (border * [lens.width, lens.height] - [pinhole.cx, pinhole.cy]) / [pinhole.fx, pinhole.fy]
+    t = np.linspace(0, 1, _SAMPLES)
+    grid = np.stack(np.meshgrid(t, t), axis=-1)  # row, column, (x, y)
+    rays = (grid * [lens.width, lens.height] - [pinhole.cx, pinhole.cy]) / [pinhole.fx, pinhole.fy]
     if lens.fisheye:
-        pixels = cv2.fisheye.distortPoints(rays[:, None], lens.matrix(), lens.coefficients)[:, 0]
+        pixels = cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), lens.matrix(), lens.coefficients)
     else:
-        homogeneous = np.column_stack((rays, np.ones(len(rays))))
-        pixels = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), lens.matrix(), lens.coefficients)[0][:, 0]
+        homogeneous = np.concatenate((rays, np.ones_like(rays[..., :1])), axis=-1).reshape(-1, 3)
+        pixels, _ = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), lens.matrix(), lens.coefficients)
+    pixels = pixels.reshape(grid.shape)
+    right, down = np.diff(pixels, axis=1)[:-1], np.diff(pixels, axis=0)[:, :-1]
+    unfolded = right[..., 0] * down[..., 1] > right[..., 1] * down[..., 0]
     slack = 1 + 0.01 * max(lens.width, lens.height)
-    return bool(((pixels >= -slack) & (pixels <= np.array([lens.width, lens.height]) + slack)).all())
+    inside = (pixels >= -slack) & (pixels <= np.array([lens.width, lens.height]) + slack)
+    return bool(unfolded.all() and inside.all())
 
 
 @lru_cache(maxsize=1)

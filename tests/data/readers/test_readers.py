@@ -241,6 +241,7 @@ LENSES = [
     Lens(160, 120, 150.0, 140.0, 82.0, 57.0, (-0.2, 0.05, 0.002, -0.001)),
     Lens(160, 120, 150.0, 150.0, 80.0, 60.0, (0.15, 0.0, 0.0, 0.0)),
     Lens(160, 120, 100.0, 100.0, 80.0, 60.0, (0.05, -0.01, 0.002, 0.0), fisheye=True),
+    Lens(160, 120, 67.0, 67.0, 80.0, 60.0, (-0.29, 0.06, 0.0, 0.0, -0.012)),  # folded by OpenCV's pinhole
 ]
 
 
@@ -253,7 +254,7 @@ def distorted(lens: Lens, rays: np.ndarray) -> np.ndarray:
     return cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(lens.distortion))[0].reshape(rays.shape)
 
 
-@pytest.mark.parametrize("lens", LENSES, ids=["opencv", "radial", "fisheye"])
+@pytest.mark.parametrize("lens", LENSES, ids=["opencv", "radial", "fisheye", "action"])
 def test_undistortion_is_the_lens_formula_and_leaves_no_border(lens: Lens) -> None:
     """A smooth function of the distorted position, sampled through the new pinhole's rays, is what `undistort` gives."""
     file = Path("scene")
@@ -268,6 +269,8 @@ def test_undistortion_is_the_lens_formula_and_leaves_no_border(lens: Lens) -> No
     source = distorted(lens, rays)
     assert source.min() > -1
     assert (source < [161, 121]).all()
+    right, down = np.diff(source, axis=1)[:-1], np.diff(source, axis=0)[:, :-1]
+    assert (right[..., 0] * down[..., 1] > right[..., 1] * down[..., 0]).all()  # it is not folded
     expected = picture(source[..., 0], source[..., 1])[2:-2, 2:-2]
     found = lens.undistort(photo, pinhole).numpy()[2:-2, 2:-2]
     assert np.abs(found - expected).max() < 5e-3
