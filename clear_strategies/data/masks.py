@@ -73,7 +73,7 @@ def _mask_folders(root: Path, parent: Path) -> Iterator[Path]:
         for name in (f"masks{size}", "masks", "mask"):
             yield root.joinpath(*parts[:i], name, *parts[i + 1 :])
     for name in ("masks", "mask"):
-        yield root.joinpath(name, *parts)
+        yield from (root.joinpath(*parts[:i], name, *parts[i:]) for i in range(len(parts) or 1))
         yield parent / name
 
 

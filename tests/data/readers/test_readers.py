@@ -209,18 +209,19 @@ def test_smaller_photos_rescale_their_cameras_per_axis(tmp_path: Path) -> None:
     assert "16x12 to 8x7" in capture.notes["cameras"]
 
 
-def test_photos_may_all_lie_in_subfolders_with_masks_in_subfolders_of_the_same_names(tmp_path: Path) -> None:
+@pytest.mark.parametrize("folder", ["images", "."])
+def test_photos_may_all_lie_in_subfolders_with_masks_in_subfolders_of_the_same_names(folder, tmp_path: Path) -> None:
     listing = tiny.colmap_txt(tmp_path) / "sparse/0/images.txt"
     text = listing.read_text()
     for name in tiny.NAMES:
-        (tmp_path / f"images/cam_{name[0]}").mkdir()
-        (tmp_path / "images" / name).rename(tmp_path / f"images/cam_{name[0]}/1.png")
+        (tmp_path / folder / f"cam_{name[0]}").mkdir()
+        (tmp_path / "images" / name).rename(tmp_path / folder / f"cam_{name[0]}/1.png")
         text = text.replace(f" {name}\n", f" cam_{name[0]}/1.png\n")
     listing.write_text(text)
     for place, grey in (("cam_a/1.png.png", 0.0), ("cam_b/1.png", 1.0)):
         photo_files.write_png(tmp_path / "masks" / place, torch.full((12, 16), grey))
-    shutil.copytree(tmp_path / "images/cam_a", tmp_path / "images/cam_d")
-    capture = colmap.read(tmp_path)
+    shutil.copytree(tmp_path / folder / "cam_a", tmp_path / folder / "cam_d")
+    capture = colmap.read(tmp_path, folder)
     assert [frame.name for frame in capture.frames] == ["cam_a/1.png", "cam_b/1.png", "cam_c/1.png"]
     assert capture.notes["without pose"] == "1 photo, not used: cam_d/1.png"
     a, b, c = (frame.load().shown for frame in capture.frames)
