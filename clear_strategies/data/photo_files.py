@@ -108,6 +108,8 @@ def read_layers(
         as_asked = decoded_upright or not sixteen_bits if turn else turn is False and not decoded_upright
         if orientation != 1 and not as_asked:
             raise _rotation_error(path, orientation)
+        if decoded_upright:  # with a name, Pillow would map the file into memory at its upright size, and scramble it
+            image.filename = ""  # type: ignore[attr-defined]
         try:
             image.load()
         except Exception as error:  # PIL's decoders raise many types of error on damaged bytes
