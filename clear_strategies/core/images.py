@@ -60,9 +60,25 @@ def resize(
     if (height, width) == tuple(image.shape[:2]):
         return image.clone()
     if kernel == "area":
+        if image.shape[0] % height or image.shape[1] % width:  # torch's pooling takes whole pixels alone
+            return _block_means(_block_means(image, height, 0), width, 1).clamp(0, 1)
         return _hwc(F.adaptive_avg_pool2d(_nchw(image), (height, width))).clamp(0, 1)
     small = Image.fromarray(to_bytes(image)).resize((width, height), _PIL_FILTERS[kernel])
     return torch.from_numpy(np.array(small)).to(image) / 255
+
+
+def _block_means(image: Float[Tensor, "H W C"], count: int, dim: int) -> Float[Tensor, "h w C"]:
+    """The means of `count` equal blocks of rows (`dim` 0) or columns (1); a pixel on an edge counts by its share."""
+    size = image.shape[dim]
+    edges = torch.arange(count + 1, dtype=torch.float64) * size / count
+    start, end = edges[:-1], edges[1:]
+    means = image.new_zeros(())
+    for k in range(size // count + 2):  # the most pixels that a block touches
+        pixel = start.long() + k
+        share = (torch.minimum(end, pixel + 1) - torch.maximum(start, pixel)).clamp_min(0) * count / size
+        pixels = image.index_select(dim, pixel.clamp_max(size - 1).to(image.device))
+        means = means + pixels * share.view(-1, *[1] * (2 - dim)).to(image)
+    return means
 
 
 def area_mean(image: Float[Tensor, "H W C"], factor: int) -> Float[Tensor, "h w C"]:

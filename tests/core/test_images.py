@@ -14,7 +14,8 @@ def test_resizing_is_downsampling_where_the_factor_is_whole():
         small = images.resize(image, (5, 3), kernel)
         assert torch.allclose(small, images.downsample(image, 4, kernel), atol=1e-6)
     assert torch.equal(images.resize(image, (20, 12)), image)
-    assert images.resize(image, (7, 5), "area").shape == (5, 7, 3)
+    finer = image.repeat_interleave(5, 0).repeat_interleave(7, 1)  # of which every 12 x 20 give a pixel of 5 x 7
+    assert torch.allclose(images.resize(image, (7, 5), "area"), finer.view(5, 12, 7, 20, 3).mean((1, 3)), atol=1e-6)
 
 
 def test_the_area_mean_and_its_vjp_are_adjoint():
