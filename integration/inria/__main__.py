@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
+from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from clear_strategies.errors import HostError
 from integration import launcher
@@ -26,7 +27,9 @@ from integration.views import no_stereo
 
 _log = logging.getLogger("integration.inria")  # __name__ is "__main__" here
 _SETUP: Final = "training_setup"
-_BY_HAND: Final = "Put the line install(gaussians, scene, opt, …) into the script instead."
+_BY_HAND: Final = (
+    "Put the line install(gaussians, scene, opt, …) into the script; attach, if another function than render draws."
+)
 
 
 @contextmanager
@@ -69,23 +72,27 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
         return setup_and_install
 
     @functools.wraps(render)
-    def render_unless_unknown(camera: Any, gaussians: Any, *args: Any, **kwargs: Any) -> Any:
-        if not models and torch.is_grad_enabled() and getattr(gaussians, "optimizer", None) is not None:
-            raise HostError(
-                f"{type(gaussians).__name__} would train without CLEAR: it has an optimizer, but not by "
-                f"scene.GaussianModel.{_SETUP}. {_BY_HAND}"
-            )
-        return drawing[-1](camera, gaussians, *args, **kwargs)
+    def render_as_attached(*args: Any, **kwargs: Any) -> Any:
+        return drawing[-1](*args, **kwargs)
 
     with ExitStack() as undo:
         undo.enter_context(watching)
-        watching.enter_context(replaced_everywhere(render, render_unless_unknown))
+        watching.enter_context(replaced_everywhere(render, render_as_attached))
+        watching.callback(register_optimizer_step_pre_hook(_refuse_to_train).remove)
         undo.enter_context(replaced_attribute(scene.Scene, "__init__", init_and_remember))
         for name in [name for name in dir(of) if name.startswith(_SETUP)]:
             undo.enter_context(replaced_attribute(of, name, installing(getattr(of, name))))
         yield attached
         for each in attached:
             _log.info("%s.", each.attachment.summary())
+
+
+def _refuse_to_train(optimizer: torch.optim.Optimizer, *_: Any) -> None:
+    """GES sets up a model of another class, and draws it by another function."""
+    if any(group.get("name") == "xyz" for group in optimizer.param_groups):
+        raise HostError(
+            f"the Gaussians of {sys.argv[0]} would train without CLEAR: no scene.GaussianModel.{_SETUP} set them up. {_BY_HAND}"
+        )
 
 
 def _of_trainer(name: str) -> Any:

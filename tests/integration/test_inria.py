@@ -590,12 +590,15 @@ def test_each_model_has_the_strategies_where_a_script(script, inria_host, inria_
     assert not hasattr(inria_host.render, "__wrapped__")
 
 
-def test_a_model_that_would_train_without_the_strategies_is_refused_at_its_first_rendering(
-    inria_host, inria_launched, caplog, monkeypatch
+@pytest.mark.parametrize("drawing", ["", "render = render.__wrapped__"])
+def test_a_model_that_would_train_without_the_strategies_is_refused_at_its_first_step(
+    drawing, inria_host, inria_launched, caplog, monkeypatch
 ):
+    """GES's has another class, and is drawn by another function."""
     monkeypatch.setattr(inria_host.GaussianModel, "own_setup", inria_host.GaussianModel.training_setup, raising=False)
-    assert inria_launched(change=(SETUP, "gaussians.own_setup(opt)")) == 2
-    assert "GaussianModel would train without CLEAR" in caplog.text
+    own = f"global render\n    {drawing}\n    gaussians.own_setup(opt)"
+    assert inria_launched("--iterations", "4", change=(SETUP, own)) == 2
+    assert "would train without CLEAR" in caplog.text
     assert not hasattr(inria_host.render, "__wrapped__")
 
 
