@@ -121,8 +121,11 @@ class Attached:
         undo.enter_context(replaced_methods(gaussians, {
             **dict.fromkeys(_SAVERS, self._save_with_detail), "compute_3D_filter": self._compute_filter_at_hr,
             "training_setup": self._training_setup, "relocate_gs": self._relocate,
+            "add_densification_stats": self._add_densification_stats,
         }))  # fmt: skip
         self._black: bool | None = None  # the host's background, once it is known
+        self._centres = "viewspace_points"  # of a rendering, the tensor whose gradient the densifier reads
+        self._rendered: Mapping[str, Any] = {}  # at LR, until the densifier has it
         self._hooks: list[Any] = []
         self._hook_optimizer()
 
@@ -161,7 +164,11 @@ class Attached:
                 with collected_drawings() as drawings:
                     result = render(*call.args, **call.kwargs)
                 ranks = hasattr(self._model, "xyz_gradient_accum_abs")
-                output = host_output(result, pinhole, params, gate, drawings, ranks_by_third_column=ranks)
+                output = host_output(
+                    result, pinhole, params, gate, drawings, centres=self._centres, ranks_by_third_column=ranks
+                )
+                if target == "lr":
+                    self._rendered = result
                 self._warn_of_what_was_not_read(overrides, output)
                 return output
 
@@ -238,6 +245,12 @@ class Attached:
                 "%s relocates Gaussians by their opacity: the densification score of %s has no effect.",
                 type(self._model).__name__, type(scoring).__name__,
             )  # fmt: skip
+        return original(*args, **kwargs)
+
+    def _add_densification_stats(self, original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """Its first argument is viewspace_points; in Deformable 3DGS and others it is viewspace_points_densify."""
+        centres, rendered, self._rendered = next(iter((*args, *kwargs.values())), None), self._rendered, {}
+        self._centres = next((name for name, x in rendered.items() if x is centres), self._centres)
         return original(*args, **kwargs)
 
     def _training_setup(self, original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

@@ -100,6 +100,7 @@ def host_output(
     gate: Float[Tensor, " N"] | None,
     drawings: Sequence[Drawing],
     *,
+    centres: str,
     ranks_by_third_column: bool,
 ) -> HostOutput:
     """The result of a host's `render`: a dict with "render" [3 or more, H, W], whose first channels are RGB, "viewspace_points"
@@ -108,6 +109,7 @@ def host_output(
 
     Args:
         camera: the camera of the photo at this resolution. drawings: see `AutogradShot`.
+        centres: "viewspace_points", or what has their gradient for the densifier.
         ranks_by_third_column: a third column of "viewspace_points" holds what the host ranks Gaussians by. Mip-Splatting splits
             as many by the absolute gradient as by the gradient, so that only its order counts.
 
@@ -118,7 +120,7 @@ def host_output(
     if not isinstance(result, Mapping) or any(name not in result for name in names):
         found = ", ".join(map(str, result)) if isinstance(result, Mapping) else type(result).__name__
         raise HostError(f"render must return a dict with {', '.join(names)}, got {found}. Wrap a function that does.")
-    image, centres, radii = (result[name] for name in names[:3])
+    image, screen, radii = (result[name] for name in ("render", centres, "radii"))
     if tuple(image.shape[1:]) != (camera.height, camera.width) or len(image) < 3:
         raise HostError(
             f"render must return an RGB image of {camera.width}x{camera.height} pixels, the size of its camera, got shape "
@@ -141,8 +143,8 @@ def host_output(
         passed = passed & kept if passed.dtype == torch.bool else passed[kept[passed.reshape(-1)]]
         result = {**result, "radii": radii, "visibility_filter": passed}
     width, height = camera.width, camera.height
-    ranked = 2 if ranks_by_third_column and centres.shape[-1] == 3 else None
-    slot = ScreenGradientSlot(centres, (width, height), (2 / width, 2 / height), ranked=ranked)
+    ranked = 2 if ranks_by_third_column and screen.shape[-1] == 3 else None
+    slot = ScreenGradientSlot(screen, (width, height), (2 / width, 2 / height), ranked=ranked)
     means2d = project(params["means"].detach(), camera)
     shot = AutogradShot(image[:3].permute(1, 2, 0), means2d, visible, params, slot, drawings=drawings)
     return HostOutput(shot, result, marks)

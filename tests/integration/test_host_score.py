@@ -150,6 +150,26 @@ def test_mip_splattings_third_column_holds_the_score_too(inria_host, inria_attac
     assert float(gradient[:, 2].max()) > 0
 
 
+def test_the_score_goes_to_the_tensor_of_the_rendering_that_the_densifier_reads(inria_host, inria_attached):
+    """In Deformable 3DGS it is not viewspace_points, which is known from the first time on."""
+
+    def render(*args, **kwargs):
+        package = inria_host.render(*args, **kwargs)
+        other = torch.zeros(N, 3, requires_grad=True)
+        image = package["render"] + 0 * other.sum()
+        return {**package, "render": image, "viewspace_points": other, "read": package["viewspace_points"]}
+
+    clear, gaussians, scene = inria_attached(P2G(patch=4))
+    for _ in range(2):
+        package = clear.wrap(render)(scene.cameras[0], gaussians, None, None)
+        inria_host.photometric(package["render"], scene.cameras[0].original_image).backward()
+        gaussians.add_densification_stats(package["read"], package["visibility_filter"])
+        gaussians.optimizer.step()
+        gaussians.optimizer.zero_grad()
+    assert package["read"].grad[:, 0].any()
+    assert not package["read"].grad[:, 1].any()
+
+
 def test_mip_splattings_filter_is_that_of_the_hr_cameras(inria_host, inria_capture, monkeypatch):
     """With that of the LR cameras, no Gaussian could be as thin as what the SR images show."""
     gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
