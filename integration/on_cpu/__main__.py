@@ -91,11 +91,13 @@ def prepared(script: Path, arguments: Sequence[str] = ()) -> launcher.Trainer:
 
 
 class _OwnRasterizers:
-    """Behind all finders of modules: what a fork names its rasterizer, e.g. diff_surfel_rasterization, and none of them finds."""
+    """Behind all finders of modules: what a fork names its rasterizer, e.g. diff_surfel_rasterization, or imports of one, e.g.
+    diff_gaussian_rasterization._C, and none of them finds.
+    """
 
     @staticmethod
     def find_spec(name: str, path: Any = None, target: Any = None) -> None:
-        if "rasterization" in name and path is None:
+        if "rasterization" in name:
             raise diff_gaussian_rasterization.OwnRasterizerError(f"the module {name}")
 
 

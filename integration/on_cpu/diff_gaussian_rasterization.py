@@ -40,6 +40,7 @@ from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, Rendering, Splats, WithTraits
 from rasterizers.reference.projection import footprints
 
+__path__: Final[list[str]] = []  # so that the import of a part, e.g. of _C, is told as one of a rasterizer
 _NEAR: Final = 0.2  # what 3DGS draws begins at this depth
 _KERNEL: Final = 0.3  # its 2D kernel's variance, px²
 

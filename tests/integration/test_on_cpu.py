@@ -387,13 +387,15 @@ def test_a_fork_with_3dgss_settings_gets_what_its_call_unpacks_or_is_refused(unp
     assert all(torch.equal(x, expected[kind]) for x, kind in zip(more, drawn, strict=True))
 
 
-def test_a_fork_may_do_without_what_it_tries_to_import(tmp_path):
+@pytest.mark.parametrize("own", ["diff_gaussian_rasterization_ms", "diff_gaussian_rasterization._C"])
+def test_a_fork_may_do_without_what_it_tries_to_import(own, tmp_path):
     """3DGS tries its SparseGaussianAdam. What ends a script is one line."""
-    module = "diff_gaussian_rasterization"
-    source = f"try:\n    from {module} import SparseGaussianAdam\nexcept ImportError:\n    import {module}_ms"
+    source = (
+        f"try:\n    from diff_gaussian_rasterization import SparseGaussianAdam\nexcept ImportError:\n    import {own}"
+    )
     done = launched(tmp_path, "trainer/train.py", source=source)
     assert done.returncode == 2
-    assert f"for the module {module}_ms" in done.stderr
+    assert f"for the module {own}" in done.stderr
     assert "Traceback" not in done.stderr
 
 
