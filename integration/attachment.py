@@ -98,6 +98,7 @@ class Attachment:
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._logged: dict[str, Logged] = {}
         self._dropped = False  # the last pass found that the loop had dropped the gradients of those before
+        self._learning: Tensor | None = None  # rows that the first merge gives a gradient of their positions
         conductor.on_fit_start(len(views), seed, means.device, views)
         self._run = conductor.run
         announce(conductor, views, host)
@@ -225,6 +226,7 @@ class Attachment:
                     f"the loop steps by a gradient scaler, which multiplies its loss by {scale:g}, but not what is added. Pass "
                     "loss_scale=scaler.get_scale; train a 3DGS-style loop without it."
                 )
+            self._warn_of_frozen()
             self._merging.fading.before_step(max(self.passes, self._host.accumulation))
             return
         names = [*trained(self._host.leaves())]
@@ -238,6 +240,19 @@ class Attachment:
             "the host makes a step in which no strategy takes part: %s, and %s changed without CLEAR or not at all. %s",
             cause, ", ".join(names) or "nothing", remedy,
         )  # fmt: skip
+
+    def _warn_of_frozen(self) -> None:
+        """In the first step: LapisGS freezes Gaussians by their gradients, which f_det and extra views do not obey."""
+        rows, self._learning, grad = self._learning, None, self._host.leaves()["means"].grad
+        changes = self.conductor.uses_hr or self.conductor.showing
+        if rows is None or grad is None or len(grad) != len(rows) or not changes:
+            return
+        if n := int((rows & ~grad.any(-1)).sum()):
+            _log.warning(
+                "the loop sets the gradients of %s Gaussians to 0 before it steps. If it freezes them, f_det still changes their "
+                "colours, extra views move them, and fading opacities fade. Leave out what is not meant, e.g. pseudo_views.",
+                f"{n:,}",
+            )  # fmt: skip
 
     def _after_optimizer(self) -> None:
         """Finish the step once all optimizers have stepped: strategies may change parameters in place, and the loop may compute
@@ -294,6 +309,8 @@ class Attachment:
         self._steps.on_merge(first=conflict is not None)
         if conflict is None:
             return
+        if self.counts["merges"] == 1 and (grad := self._host.leaves()["means"].grad) is not None:
+            self._learning = grad.any(-1)
         self._dropped = self.passes > 0 and not any(bool(g.any()) for name, g in before.items() if name != "detail")
         if self._dropped:
             self.passes = self._merging.fading.passes = 0

@@ -307,6 +307,16 @@ def test_hooks_that_freeze_some_gaussians_freeze_their_f_det(late):
     assert bool((host.splats["detail"][5:] != 0).any())
 
 
+@pytest.mark.parametrize("frozen", [0, 5])
+def test_a_loop_that_freezes_gaussians_by_their_gradients_is_told(frozen, caplog):
+    host, _, render = started()
+    for _ in range(2):
+        render().mean().backward()
+        host.splats["means"].grad[:frozen] = 0
+        host.step()
+    assert caplog.text.count("to 0 before it steps") == (frozen > 0)
+
+
 def test_a_hook_after_accumulation_is_called_once_where_the_loss_reaches_f_det_too():
     host, _, render = started()
     found = []
