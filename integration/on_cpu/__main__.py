@@ -115,9 +115,14 @@ def _knn(renderer: Path | None) -> Any:
     root = Path() if renderer is None else renderer.parent
     sources = (root / "submodules" / "simple-knn" / "spatial.h", root / "scene" / "gaussian_model.py")
     indices = any(_RETURNS_INDICES.search(file.read_text(encoding="utf-8")) for file in sources if file.is_file())
-    if indices:
-        return SimpleNamespace(distCUDA2=distances_and_indices)
-    return SimpleNamespace(distCUDA2=lambda points: distances_and_indices(points)[0])
+    return _Knn(distCUDA2=distances_and_indices if indices else lambda points: distances_and_indices(points)[0])
+
+
+class _Knn(SimpleNamespace):
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise diff_gaussian_rasterization.OwnRasterizerError(f"simple_knn._C.{name}")
 
 
 def _given(arguments: Sequence[str]) -> Iterator[str]:

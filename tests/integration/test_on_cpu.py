@@ -387,15 +387,20 @@ def test_a_fork_with_3dgss_settings_gets_what_its_call_unpacks_or_is_refused(unp
     assert all(torch.equal(x, expected[kind]) for x, kind in zip(more, drawn, strict=True))
 
 
-@pytest.mark.parametrize("own", ["diff_gaussian_rasterization_ms", "diff_gaussian_rasterization._C"])
-def test_a_fork_may_do_without_what_it_tries_to_import(own, tmp_path):
+@pytest.mark.parametrize(
+    ("needs", "own"),
+    [
+        ("import diff_gaussian_rasterization_ms", "the module diff_gaussian_rasterization_ms"),
+        ("import diff_gaussian_rasterization._C", "the module diff_gaussian_rasterization._C"),
+        ("from simple_knn._C import distIndex2", "simple_knn._C.distIndex2"),
+    ],
+)
+def test_a_fork_may_do_without_what_it_tries_to_import(needs, own, tmp_path):
     """3DGS tries its SparseGaussianAdam. What ends a script is one line."""
-    source = (
-        f"try:\n    from diff_gaussian_rasterization import SparseGaussianAdam\nexcept ImportError:\n    import {own}"
-    )
+    source = f"try:\n    from diff_gaussian_rasterization import SparseGaussianAdam\nexcept ImportError:\n    {needs}"
     done = launched(tmp_path, "trainer/train.py", source=source)
     assert done.returncode == 2
-    assert f"for the module {own}" in done.stderr
+    assert f"for {own}" in done.stderr
     assert "Traceback" not in done.stderr
 
 
