@@ -104,7 +104,7 @@ class HostMerge:
             using = [type(s).__name__ for s in map(self._conductor.owner, ("reconcile", "score")) if s is not None]
             pending.require_first(accumulated, " and ".join(using))
             names = [name for name in accumulated if name not in pending.merged]
-            if names or not (expected or pending.merged):
+            if names or not (expected or pending.merged or pending.has_no_part()):
                 self._merge(pending, done, names)
         if pending is not None and pending.others and done.renderings == {pending.nth}:
             self._add_to_others(pending, done)

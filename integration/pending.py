@@ -223,6 +223,10 @@ class Pending:
             "backward() after each rendering; with several views for a step, see accumulation=."
         )
 
+    def has_no_part(self) -> bool:
+        """Whether HR gives a gradient to f_det alone, if all parameters are frozen, as in LangSplat, which trains features."""
+        return self.hr is not None and not any(bool(g.any()) for _, g in self.others)
+
     def require_first(self, names: Iterable[str], correcting: str) -> None:
         """Raise a HostError if an earlier pass over the rendering had gradients of these parameters, and a strategy used them."""
         if correcting and (again := [name for name in names if name in self.merged]):

@@ -145,6 +145,18 @@ def test_a_host_that_masks_its_rendering_in_place_trains(inria_host, inria_captu
     assert clear.attachment.counts["merges"] == 2
 
 
+def test_a_loop_that_trains_nothing_of_the_gaussians_is_refused(inria_host, inria_attached):
+    """LangSplat trains a feature that is drawn with the image."""
+    clear, gaussians, scene = inria_attached(GCO())
+    for name, p in clear.params().items():
+        p.requires_grad_(name == "detail")
+    clear.wrap(inria_host.render)(scene.cameras[0], gaussians, None, None)["render"].mean().backward()
+    with pytest.raises(
+        HostError, match="all parameters of the Gaussians are frozen, so that no strategy would take part"
+    ):
+        gaussians.optimizer.step()
+
+
 def test_accumulated_passes_have_the_gradient_of_one_and_are_one_iteration(inria_host, inria_attached):
     found = []
     for passes in (1, 2):
