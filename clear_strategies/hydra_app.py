@@ -80,6 +80,8 @@ def main(overrides: Sequence[str] | None = None) -> None:
     for name in ("config_dir", "config_path"):
         folder = getattr(options, name)
         setattr(options, name, folder and files.expanded(folder))
+    if options.config_dir:
+        _require_read(Path(options.config_dir), Path(options.config_path or CONF))
     exit_codes.require("train")
     version.setbase("1.3")
     _begun.clear()
@@ -96,6 +98,16 @@ def main(overrides: Sequence[str] | None = None) -> None:
                 setting = shlex.quote(f"hydra.sweep.dir={folder}")
                 _log.info("Go on with the sweep by the same command with %s fit.resume=auto.", setting)
         raise
+
+
+def _require_read(folder: Path, first: Path) -> None:
+    """Raise a SettingError for a file of `--config-dir` that Hydra does not read, since `first` has one of the same name."""
+    names = (path.relative_to(first) for path in sorted(first.rglob("*.yaml")))
+    if folder.resolve() != first.resolve() and (hidden := next((n for n in names if (folder / n).is_file()), None)):
+        raise SettingError(
+            f"--config-dir: {folder / hidden} is not read, since {first} has a file of this name. Rename it; to run a saved "
+            "configuration, such as RUN/.hydra/config.yaml, give its folder by --config-path."
+        )
 
 
 def readable(word: str) -> str:

@@ -56,6 +56,15 @@ def test_a_folder_of_options_is_no_second_folder_of_photos(tmp_path, monkeypatch
         train.overrides(["photos", "mine"])
 
 
+@pytest.mark.parametrize("hidden", ["config.yaml", "strategy/gco.yaml"])  # the first: that of RUN/.hydra
+def test_a_folder_of_options_whose_file_hydra_would_not_read_is_refused(tmp_path, monkeypatch, hidden):
+    monkeypatch.setattr(hydra_app, "_run_hydra", lambda *_: None)
+    (tmp_path / hidden).parent.mkdir(exist_ok=True)
+    (tmp_path / hidden).touch()
+    with pytest.raises(SettingError, match=rf"--config-dir: .*{hidden} is not read, .* --config-path\."):
+        hydra_app.main([f"--config-dir={tmp_path}", "--config-name=config", "+strategy=gco"])
+
+
 def test_a_path_with_spaces_that_is_not_quoted_is_told(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "Meine Fotos").mkdir()
