@@ -79,7 +79,8 @@ def main(overrides: Sequence[str] | None = None) -> None:
     options.overrides = [*map(readable, options.overrides), *["fit.verbose=true"] * options.verbose]
     for name in ("config_dir", "config_path"):
         folder = getattr(options, name)
-        setattr(options, name, folder and files.expanded(folder))
+        if folder and "://" not in folder:  # Hydra looks for a relative --config-path in this package
+            setattr(options, name, str(Path(files.expanded(folder)).absolute()))
     if options.config_dir:
         _require_read(Path(options.config_dir), Path(options.config_path or CONF))
     exit_codes.require("train")

@@ -313,7 +313,8 @@ def _of_type(value: Any, hint: Any, key: str) -> Any:
     shown = repr(value) if isinstance(value, str | int | float | list | Mapping | None) else f"a {type(value).__name__}"
     remedy = ""
     if is_dataclass(hint):
-        remedy = f" Set {', '.join(_joined(key, f.name) for f in fields(hint) if f.init)}."
+        names = ", ".join(_joined(key, f.name) for f in fields(hint) if f.init)
+        remedy = f" Set {names}." if names else f" ~{key} leaves it out."
     elif isinstance(value, int | float) and _fitted(str(value), hint) is not _ABSENT:
         remedy = f" As text it is written '{key}=\"{value}\"'."
     raise SettingError(f"{key}: must be {_in_words(hint)}, got {shown}.{remedy}")

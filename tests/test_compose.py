@@ -140,6 +140,23 @@ def test_a_hydra_application_keeps_its_own_state():
     assert not GlobalHydra.instance().is_initialized()
 
 
+@pytest.mark.parametrize(
+    ("config", "words", "message"),
+    [
+        (
+            "config",
+            ["+strategy=gco", "strategies.gco=null"],
+            r"^strategies\.gco: .*, got None\. ~strategies\.gco leaves it out",
+        ),
+        ("config", ["~rasterizer"], r"^rasterizer: is needed and missing\. Add \+rasterizer="),
+        ("conductor", [], "^--config-name: must be a configuration of a run"),
+    ],
+)
+def test_a_configuration_that_lacks_a_part_of_a_run_is_refused(config, words, message):
+    with pytest.raises(SettingError, match=message):
+        settings_of(tree(compose_module.composed(words, config)))
+
+
 def test_clear_on_the_command_line_is_clear_in_python():
     """The defaults have one owner, the class: strategies, objective and all numbers are the same, field by field."""
     ours = Conductor(GCO(), P2G(), SVS())

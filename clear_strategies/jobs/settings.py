@@ -64,5 +64,8 @@ def settings_of(values: Mapping[str, Any]) -> JobSettings:
         if key not in known and (near := difflib.get_close_matches(key, groups, 1)):
             word = f"{'' if near[0] in values else '+'}{near[0]}={value if isinstance(value, str) else '…'}"
             raise SettingError(f"{key}: there is no such setting. Did you mean {word}?")
-    settings: JobSettings = build({**values, "rasterizer": device.rasterizer_node(values["rasterizer"])})
+    nodes = {"rasterizer": device.rasterizer_node(values["rasterizer"])} if "rasterizer" in values else {}
+    settings = build({**values, **nodes})
+    if not isinstance(settings, JobSettings):
+        raise SettingError("--config-name: must be a configuration of a run, as config of conf/ is. Leave it out.")
     return settings

@@ -88,7 +88,9 @@ def test_a_tilde_that_no_shell_expanded_is_the_users_folder(tmp_path, monkeypatc
         hydra_app, "_run_hydra", lambda options, *_: given.extend([options.config_dir, options.config_path])
     )
     hydra_app.main(["--config-dir=~/more", "--config-path=~/own"])
-    assert given == [f"{tmp_path}/more", f"{tmp_path}/own"]
+    monkeypatch.chdir(tmp_path)
+    hydra_app.main(["--config-path=run/.hydra"])
+    assert given == [f"{tmp_path}/more", f"{tmp_path}/own", None, f"{tmp_path}/run/.hydra"]
     assert commands.parser_of("view", "").parse_args(["~/run"]).run == tmp_path / "run"
     make_run(tmp_path / "done")
     assert Run(Path("~/done")).folder == tmp_path / "done"
