@@ -206,7 +206,7 @@ class GaussianRasterizer(torch.nn.Module):
             if kind == "alpha":
                 return alpha[None]
             z = depths(means3D, pose.to(means3D))[:, None].clamp_min(_NEAR)
-            return _sum(rasterizer, camera, inputs, 1 / z if kind == "inverse" else z)
+            return _sum(rasterizer, camera, inputs, centres, 1 / z if kind == "inverse" else z)
 
         return image, radii, *map(drawn_as, kinds)
 
@@ -251,7 +251,7 @@ def _gradient_probe(
 
 
 def _sum(
-    rasterizer: Rasterizer, camera: Camera, inputs: Inputs, values: Float[Tensor, "N 1"]
+    rasterizer: Rasterizer, camera: Camera, inputs: Inputs, centres: Float[Tensor, "N 2"], values: Float[Tensor, "N 1"]
 ) -> Float[Tensor, "1 H W"]:
     """Σ w · value of a pixel's Gaussians.
 
@@ -259,12 +259,12 @@ def _sum(
     image in one pass where the image is the only drawing.
     """
 
-    def drawn(values: Tensor, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:
+    def drawn(values: Tensor, centres: Tensor, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:
         colors = constant_band(values.expand(-1, 3))
         splats = Splats(means, quats, scales, opacities, colors, colors[:, 1:])
-        return autograd.draw(rasterizer, splats, camera, colors=colors).image[..., 0][None]
+        return autograd.draw(rasterizer, splats, camera, centres, colors=colors).image[..., 0][None]
 
-    shapes = inputs[:4]
+    shapes = centres, *inputs[:4]
     if any(x.requires_grad for x in shapes):
         return cast(Tensor, checkpoint(drawn, values, *shapes, use_reentrant=True, preserve_rng_state=False))
     return drawn(values, *shapes)

@@ -134,6 +134,7 @@ def test_depth_is_the_sum_of_the_gaussians_depths_and_can_be_learned_from(fork, 
     again = rasterizer(**changes, colors_precomp=of_z(given_again["means3D"][:, 2:] + 4).expand(-1, 3))[0][0]
     again.sum().backward()
     assert torch.allclose(expected, given_again["means3D"].grad, rtol=1e-3, atol=1e-4)
+    assert torch.allclose(given["means2D"].grad, given_again["means2D"].grad, rtol=1e-3, atol=1e-4)
     assert given["shs"].grad is None
 
 
