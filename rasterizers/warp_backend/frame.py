@@ -388,5 +388,5 @@ def _cuts_struct(settings: WarpRasterizer) -> Any:
     cuts.kernel, cuts.near, cuts.antialiased = settings.kernel, settings.near, settings.antialiased
     cuts.near_bits = int.from_bytes(struct.pack("<d", settings.near), "little")
     cuts.alpha_min, cuts.alpha_max = settings.alpha_min, settings.alpha_max
-    cuts.transmittance_min = settings.transmittance_min
+    cuts.transmittance_min = max(settings.transmittance_min, 1e-30)  # as in C++: no VJP rebuilds a subnormal T
     return cuts.__ctype__()  # type: ignore[attr-defined]
