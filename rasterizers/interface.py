@@ -386,7 +386,7 @@ class RasterSettings:
         kernel: variance of the 2D Mip kernel, px² (Mip-Splatting: 0.1).
         near: smallest depth at which a Gaussian is drawn, world units.
         alpha_min: a contribution below it is not blended (1/255: the usual default).
-        alpha_max: cap on a single contribution, in (0, 1).
+        alpha_max: cap on a single contribution, in (0, 1 - 1e-7]: in float32, a number nearer to 1 is 1.
         transmittance_min: a pixel ends before its transmittance falls below it.
         background: RGB in [0, 1].
         antialiased: scale the opacity to make up for the blur of the 2D kernel (Mip-Splatting).
@@ -408,9 +408,9 @@ class RasterSettings:
             raise ValueError(f"kernel must be a variance >= 0 px², got {self.kernel}.")
         if not (math.isfinite(self.near) and self.near > 0):
             raise ValueError(f"near must be > 0, got {self.near}.")
-        if not 0 < self.alpha_min < self.alpha_max < 1:
+        if not 0 < self.alpha_min < self.alpha_max <= 1 - 1e-7:
             raise ValueError(
-                f"0 < alpha_min < alpha_max < 1 must hold, got alpha_min={self.alpha_min}, alpha_max={self.alpha_max}."
+                f"0 < alpha_min < alpha_max <= 1 - 1e-7 must hold, got alpha_min={self.alpha_min}, alpha_max={self.alpha_max}."
             )
         if not 0 <= self.transmittance_min < 1:
             raise ValueError(f"transmittance_min must lie in [0, 1), got {self.transmittance_min}.")

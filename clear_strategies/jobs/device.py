@@ -36,7 +36,7 @@ class RasterizerSettings:
         kernel: variance of the 2D Mip kernel, px².
         near: smallest depth at which a Gaussian is drawn, world units.
         alpha_min: a contribution below it is not blended; None: by the preset.
-        alpha_max: cap on a single contribution, in (0, 1).
+        alpha_max: cap on a single contribution, in (0, 1 - 1e-7].
         transmittance_min: a pixel ends before its transmittance falls below it; None: by the preset.
         antialiased: scale the opacity to make up for the blur of the 2D kernel (Mip-Splatting).
         background: RGB in [0, 1]; None: that of the data set.

@@ -86,6 +86,8 @@ def test_a_preset_sets_the_cut_offs_and_where_no_rasterizer_draws_the_error_says
         assert cuts[-1] == (preset["alpha_min"], preset["transmittance_min"])
         assert rasterizers.load("torch", preset=name, alpha_min=1 / 64) == replace(rasterizer, alpha_min=1 / 64)
     assert cuts == sorted(cuts, reverse=True)  # coarsest first
+    with pytest.raises(ValueError, match="alpha_max <= 1 - 1e-7 must hold"):
+        rasterizers.load("torch", alpha_max=1 - 1e-8)  # in float32 it is 1, which divides by 0
 
 
 def test_a_scaled_camera_has_the_same_field_of_view():
