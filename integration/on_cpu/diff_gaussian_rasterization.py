@@ -259,7 +259,9 @@ def _sum(
     image in one pass where the image is the only drawing.
     """
 
-    def drawn(values: Tensor, centres: Tensor, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:
+    def drawn(
+        values: Tensor, centres: Tensor, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor
+    ) -> Tensor:
         colors = constant_band(values.expand(-1, 3))
         splats = Splats(means, quats, scales, opacities, colors, colors[:, 1:])
         return autograd.draw(rasterizer, splats, camera, centres, colors=colors).image[..., 0][None]
