@@ -98,7 +98,7 @@ class Attachment:
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._logged: dict[str, Logged] = {}
         self._dropped = False  # the last pass found that the loop had dropped the gradients of those before
-        self._learning: Tensor | None = None  # rows that the first merge gives a gradient of their positions
+        self._learning: Tensor | None = None  # until the first step: rows with a gradient of means
         conductor.on_fit_start(len(views), seed, means.device, views)
         self._run = conductor.run
         announce(conductor, views, host)
@@ -243,9 +243,9 @@ class Attachment:
 
     def _warn_of_frozen(self) -> None:
         """In the first step: LapisGS freezes Gaussians by their gradients, which f_det and extra views do not obey."""
-        rows, self._learning, grad = self._learning, None, self._host.leaves()["means"].grad
-        changes = self.conductor.uses_hr or self.conductor.showing
-        if rows is None or grad is None or len(grad) != len(rows) or not changes:
+        leaves, rows, self._learning = self._host.leaves(), self._learning, None
+        grad, changes = leaves["means"].grad, self.conductor.showing or ("detail" in leaves and self.conductor.uses_hr)
+        if rows is None or grad is None or grad.is_sparse or len(grad) != len(rows) or not changes:
             return
         if n := int((rows & ~grad.any(-1)).sum()):
             _log.warning(
@@ -309,7 +309,7 @@ class Attachment:
         self._steps.on_merge(first=conflict is not None)
         if conflict is None:
             return
-        if self.counts["merges"] == 1 and (grad := self._host.leaves()["means"].grad) is not None:
+        if self._steps.by_hand is not None and (grad := self._host.leaves()["means"].grad) is not None:
             self._learning = grad.any(-1)
         self._dropped = self.passes > 0 and not any(bool(g.any()) for name, g in before.items() if name != "detail")
         if self._dropped:

@@ -317,6 +317,28 @@ def test_a_loop_that_freezes_gaussians_by_their_gradients_is_told(frozen, caplog
     assert caplog.text.count("to 0 before it steps") == (frozen > 0)
 
 
+@pytest.mark.parametrize("how", ["a pass is dropped", "sparse", "without f_det"])
+def test_a_loop_that_freezes_no_gaussian_that_would_change_is_not_told(how, caplog):
+    """A gradient scaler drops the first passes, and another view sees other Gaussians; gsplat's loop makes gradients sparse."""
+    host = gsplat_host.Host()
+    means = host.splats["means"]
+    if how == "sparse":
+        host.optimizers["means"] = torch.optim.SparseAdam([means])
+    _, _, render = started(GCO(), host=host, detail=how != "without f_det")
+    render().mean().backward()
+    if how == "a pass is dropped":
+        for optimizer in host.optimizers.values():
+            optimizer.zero_grad()
+        means.data[:5] += 1000
+        render().mean().backward()
+    elif how == "sparse":
+        means.grad = means.grad.to_sparse(1)
+    else:
+        means.grad[:5] = 0
+    host.step()
+    assert "to 0 before it steps" not in caplog.text
+
+
 def test_a_hook_after_accumulation_is_called_once_where_the_loss_reaches_f_det_too():
     host, _, render = started()
     found = []
