@@ -109,7 +109,7 @@ def host_output(
 
     Args:
         camera: the camera of the photo at this resolution. drawings: see `AutogradShot`.
-        centres: "viewspace_points", or what has their gradient for the densifier.
+        centres: what has the gradient for the densifier; "viewspace_points", if the result lacks it.
         ranks_by_third_column: a third column of "viewspace_points" holds what the host ranks Gaussians by. Mip-Splatting splits
             as many by the absolute gradient as by the gradient, so that only its order counts.
 
@@ -120,7 +120,8 @@ def host_output(
     if not isinstance(result, Mapping) or any(name not in result for name in names):
         found = ", ".join(map(str, result)) if isinstance(result, Mapping) else type(result).__name__
         raise HostError(f"render must return a dict with {', '.join(names)}, got {found}. Wrap a function that does.")
-    image, screen, radii = (result[name] for name in ("render", centres, "radii"))
+    image, radii = result["render"], result["radii"]
+    screen = result[centres if centres in result else "viewspace_points"]
     if tuple(image.shape[1:]) != (camera.height, camera.width) or len(image) < 3:
         raise HostError(
             f"render must return an RGB image of {camera.width}x{camera.height} pixels, the size of its camera, got shape "

@@ -168,6 +168,7 @@ def test_the_score_goes_to_the_tensor_of_the_rendering_that_the_densifier_reads(
         gaussians.optimizer.zero_grad()
     assert package["read"].grad[:, 0].any()
     assert not package["read"].grad[:, 1].any()
+    clear.wrap(inria_host.render)(scene.cameras[0], gaussians, None, None)  # another function's rendering lacks it
 
 
 def test_mip_splattings_filter_is_that_of_the_hr_cameras(inria_host, inria_capture, monkeypatch):
