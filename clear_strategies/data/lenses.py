@@ -178,7 +178,7 @@ def _filled_pinhole(lens: Lens) -> Lens | None:
     if not (all(map(math.isfinite, (cx, cy))) and 0.1 < fx / lens.fx < 10 and 0.1 < fy / lens.fy < 10):
         return None
     # OpenCV returns K itself, or a view that is too wide, if it cannot invert the lens up to the corners.
-    zoomed = (Lens(*size, zoom * fx, zoom * fy, cx, cy) for zoom in np.geomspace(1.0, _MOST_ZOOM, _ZOOMS))
+    zoomed = (Lens(*size, zoom * fx, zoom * fy, cx, cy) for zoom in np.geomspace(1.0, _MOST_ZOOM, _ZOOMS).tolist())
     return next((pinhole for pinhole in zoomed if _covers(lens, pinhole)), None)
 
 

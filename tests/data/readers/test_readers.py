@@ -260,6 +260,7 @@ def test_undistortion_is_the_lens_formula_and_leaves_no_border(lens: Lens) -> No
     """A smooth function of the distorted position, sampled through the new pinhole's rays, is what `undistort` gives."""
     file = Path("scene")
     pinhole = lens.undistorted(file)
+    assert type(pinhole.fx) is float  # as the other numbers, not one of NumPy
     v, u = np.meshgrid(np.arange(120) + 0.5, np.arange(160) + 0.5, indexing="ij")
 
     def picture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
