@@ -386,7 +386,7 @@ class RasterSettings:
         kernel: variance of the 2D Mip kernel, px² (Mip-Splatting: 0.1).
         near: smallest depth at which a Gaussian is drawn, world units.
         alpha_min: a contribution below it is not blended (1/255: the usual default).
-        alpha_max: cap on a single contribution, in (0, 1 - 1e-7]: in float32, a number nearer to 1 is 1.
+        alpha_max: cap on a single contribution, in (0, 1 - 1e-7], which is below 1 in float32, too.
         transmittance_min: a pixel ends before its transmittance falls below it.
         background: RGB in [0, 1].
         antialiased: scale the opacity to make up for the blur of the 2D kernel (Mip-Splatting).
