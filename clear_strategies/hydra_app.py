@@ -106,8 +106,9 @@ def _require_read(folder: Path, first: Path) -> None:
     names = (path.relative_to(first) for path in sorted(first.rglob("*.yaml")))
     if folder.resolve() != first.resolve() and (hidden := next((n for n in names if (folder / n).is_file()), None)):
         raise SettingError(
-            f"--config-dir: {folder / hidden} is not read, since {first} has a file of this name. Rename it; to run a saved "
-            "configuration, such as RUN/.hydra/config.yaml, give its folder by --config-path."
+            f"--config-dir: {folder / hidden} is not read, since {first} has a file of this name. Rename it, or move your "
+            "options to a folder of their own; to run a saved configuration, such as RUN/.hydra/config.yaml, give its folder by "
+            "--config-path."
         )
 
 
