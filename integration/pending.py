@@ -247,7 +247,7 @@ def why_nothing_was_merged(pending: Pending | None, trained: Sequence[str]) -> t
     if not trained:
         return (
             "all parameters of the Gaussians are frozen",
-            "Let those that should train require gradients, or remove() what was attached.",
+            "Let those that should train require gradients, attach once they do, or remove() what was attached.",
         )
     if pending is None or pending.output is None:
         return (
