@@ -224,7 +224,7 @@ class Pending:
         )
 
     def has_no_part(self) -> bool:
-        """Whether HR gives a gradient to f_det alone, if all parameters are frozen, as in LangSplat, which trains features."""
+        """Return True if HR gives a gradient to f_det alone, where all parameters are frozen: LangSplat trains features."""
         return self.hr is not None and not any(bool(g.any()) for _, g in self.others)
 
     def require_first(self, names: Iterable[str], correcting: str) -> None:

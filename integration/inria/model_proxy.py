@@ -109,7 +109,7 @@ def host_output(
 
     Args:
         camera: the camera of the photo at this resolution. drawings: see `AutogradShot`.
-        centres: what has the gradient for the densifier; "viewspace_points", if the result lacks it.
+        centres: the key of the tensor whose gradient the densifier reads; where the result lacks it, "viewspace_points" is read.
         ranks_by_third_column: a third column of "viewspace_points" holds what the host ranks Gaussians by. Mip-Splatting splits
             as many by the absolute gradient as by the gradient, so that only its order counts.
 

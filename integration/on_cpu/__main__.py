@@ -119,6 +119,8 @@ def _knn(renderer: Path | None) -> Any:
 
 
 class _Knn(SimpleNamespace):
+    """simple_knn._C. A function that a fork adds to it is told in one line."""
+
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
