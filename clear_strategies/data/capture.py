@@ -6,6 +6,7 @@ Readers only read files. `prepare.py` splits a capture, makes its images at both
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -173,9 +174,10 @@ def lens_notes(frames: Sequence[Frame]) -> dict[str, str]:
     distorted = [(a, b) for a, b in pairs if a.distorts]
     if distorted:
         lens, camera = distorted[0]
+        angle = math.degrees(2 * math.atan(camera.width / camera.fx / 2))
         notes["lens"] = (
-            f"{len(distorted)} of {len(frames)} photos undistorted by OpenCV (bicubic, no borders), "
-            f"e.g. fx {lens.fx * camera.width / lens.width:.5g} to {camera.fx:.5g} px"
+            f"{len(distorted)} of {len(frames)} photos undistorted by OpenCV (bicubic, no borders), e.g. fx "
+            f"{lens.fx * camera.width / lens.width:.5g} to {camera.fx:.5g} px, {angle:.0f} degrees wide"
         )
     return notes
 

@@ -40,8 +40,11 @@ CUT: Final = (
 )
 """The remedy for panoramas of 360 degrees."""
 _SAMPLES: Final = 65  # a side
-_MOST_ZOOM: Final = 2.0  # of OpenCV's pinhole
+_MOST_ZOOM: Final = 2.0
 _ZOOMS: Final = 36
+_WIDEST: Final = math.tan(math.radians(70))
+"""The tangent of the angle between an undistorted photo's middle and its corners, at most. There a pixel is already nine times as
+long as in the middle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +72,7 @@ class Lens:
     @property
     def coefficients(self) -> Float[np.ndarray, " k"]:
         """The distortion with zeros appended, since OpenCV needs at least four numbers."""
-        return np.array([*self.distortion, *[0.0] * (4 - len(self.distortion))])
+        return np.array([*self.distortion, *[0.0] * (4 - len(self.distortion))], dtype=np.float64)
 
     def resized(self, width: int, height: int, file: Path) -> Lens:
         """Rescale the lens to an image of another size, each axis by its own factor.
@@ -164,6 +167,23 @@ def terms_of(file: Path, where: str, model: str) -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)  # a capture has few lenses
 def _filled_pinhole(lens: Lens) -> Lens | None:
+    """Return OpenCV's pinhole, or one around the lens's own middle, zoomed until it is filled; None if neither is."""
+    first = math.hypot(lens.width / lens.fx, lens.height / lens.fy) / 2 / _WIDEST  # a zoom of the lens
+    around = replace(lens, distortion=(), fisheye=False)
+    candidates = [(around, np.geomspace(first, _MOST_ZOOM, _ZOOMS))] if first < _MOST_ZOOM else []
+    # OpenCV returns K itself, or a view that is too wide, if it cannot invert the lens up to the corners.
+    if (pinhole := _opencv_pinhole(lens)) is not None:
+        candidates.insert(0, (pinhole, np.geomspace(1.0, _MOST_ZOOM, _ZOOMS)))
+    zoomed = (
+        replace(pinhole, fx=zoom * pinhole.fx, fy=zoom * pinhole.fy)
+        for pinhole, zooms in candidates
+        for zoom in zooms.tolist()
+    )
+    return next((pinhole for pinhole in zoomed if _covers(lens, pinhole)), None)
+
+
+def _opencv_pinhole(lens: Lens) -> Lens | None:
+    """Return the pinhole that OpenCV chooses; None if it finds none that is plausible."""
     import cv2
 
     size, K, coefficients = (lens.width, lens.height), lens.matrix(), lens.coefficients
@@ -177,9 +197,8 @@ def _filled_pinhole(lens: Lens) -> Lens | None:
     fx, fy, cx, cy = (float(x) for x in (new[0, 0], new[1, 1], new[0, 2] + 0.5, new[1, 2] + 0.5))
     if not (all(map(math.isfinite, (cx, cy))) and 0.1 < fx / lens.fx < 10 and 0.1 < fy / lens.fy < 10):
         return None
-    # OpenCV returns K itself, or a view that is too wide, if it cannot invert the lens up to the corners.
-    zoomed = (Lens(*size, zoom * fx, zoom * fy, cx, cy) for zoom in np.geomspace(1.0, _MOST_ZOOM, _ZOOMS).tolist())
-    return next((pinhole for pinhole in zoomed if _covers(lens, pinhole)), None)
+    pinhole = Lens(*size, fx, fy, cx, cy)
+    return pinhole if math.hypot(size[0] / fx, size[1] / fy) / 2 <= _WIDEST else None
 
 
 def _covers(lens: Lens, pinhole: Lens) -> bool:

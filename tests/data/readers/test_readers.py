@@ -243,6 +243,10 @@ LENSES = [
     Lens(160, 120, 150.0, 150.0, 80.0, 60.0, (0.15, 0.0, 0.0, 0.0)),
     Lens(160, 120, 100.0, 100.0, 80.0, 60.0, (0.05, -0.01, 0.002, 0.0), fisheye=True),
     Lens(160, 120, 67.0, 67.0, 80.0, 60.0, (-0.29, 0.06, 0.0, 0.0, -0.012)),  # folded by OpenCV's pinhole
+    Lens(160, 120, 51.0, 51.0, 81.0, 59.0, (0, 0, 0, 0), fisheye=True),  # 180 degrees: OpenCV finds no pinhole
+    Lens(
+        160, 120, 54.0, 54.0, 80.0, 60.0, (-0.006, 0.042, -0.04, 0.007), fisheye=True
+    ),  # OpenCV's would be 155 degrees wide
 ]
 
 
@@ -255,12 +259,15 @@ def distorted(lens: Lens, rays: np.ndarray) -> np.ndarray:
     return cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(lens.distortion))[0].reshape(rays.shape)
 
 
-@pytest.mark.parametrize("lens", LENSES, ids=["opencv", "radial", "fisheye", "action"])
+@pytest.mark.parametrize("lens", LENSES, ids=["opencv", "radial", "fisheye", "action", "180", "wide"])
 def test_undistortion_is_the_lens_formula_and_leaves_no_border(lens: Lens) -> None:
     """A smooth function of the distorted position, sampled through the new pinhole's rays, is what `undistort` gives."""
     file = Path("scene")
     pinhole = lens.undistorted(file)
     assert type(pinhole.fx) is float  # as the other numbers, not one of NumPy
+    assert np.hypot(160 / pinhole.fx, 120 / pinhole.fy) / 2 < np.tan(
+        np.radians(71)
+    )  # its corners are not stretched without bound
     v, u = np.meshgrid(np.arange(120) + 0.5, np.arange(160) + 0.5, indexing="ij")
 
     def picture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
