@@ -27,7 +27,7 @@ from clear_strategies.data.photo_folders import (
     usable,
 )
 from clear_strategies.data.priors import cache_folder
-from clear_strategies.data.readers import colmap, sfm
+from clear_strategies.data.readers import colmap, features, sfm
 from clear_strategies.data.readers.colmap_model import read_model
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
@@ -35,7 +35,6 @@ from clear_strategies.errors import DataError
 _log = logging.getLogger(__name__)
 
 _HEIC: Final = (".heic", ".heif")
-_FEW: Final = 30  # photos, up to which precise=auto is true
 _THUMBNAIL: Final = 64  # times as many pixels has the largest photo as one that is a preview
 _HEAD: Final = 1 << 16  # bytes of a file by which its format is recognized
 _LOOKED_INTO: Final = 50  # files of each pattern, at most
@@ -120,12 +119,12 @@ def read(
     require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
         raise DataError(root, "images", f"there are {len(paths)}, poses need at least {sfm.FEWEST}", MORE_PHOTOS)
-    precise = len(paths) <= _FEW if precise == "auto" else precise
+    precise = len(paths) <= features.PRECISE if precise == "auto" else precise
     folder = base / _cache_key(paths, max_side, max_features, precise, seed)
     if (folder / sfm.MODEL).is_file():
         _log.debug("%s: poses from the cache %s.", root, folder)
     else:
-        sfm.reconstruct(root, photos, folder, sfm.SfmSettings(max_side, max_features, precise, threads, seed))
+        sfm.reconstruct(root, photos, folder, features.SfmSettings(max_side, max_features, precise, threads, seed))
     capture = _capture(root, paths, folder)
     sfm.warn_unplaced(root, capture.unplaced, len(paths))
     sfm.require_placed(root, len(capture.frames), len(paths), least_placed)
@@ -134,7 +133,7 @@ def read(
 
 def _capture(root: Path, paths: Sequence[Path], folder: Path) -> Capture:
     """The capture of the photos that have a pose in `folder`."""
-    model, photo_of = read_model(folder), {sfm.copy_name(i): path for i, path in enumerate(paths)}
+    model, photo_of = read_model(folder), {features.copy_name(i): path for i, path in enumerate(paths)}
     posed = {image.name: photo_of[image.name] for image in model.images}
     capture = colmap.capture(root, model, root, posed, upright=True, points="estimated here by pycolmap")
     poses = f"estimated by pycolmap from all {len(paths)} photos, {len(capture.frames)} could be placed"

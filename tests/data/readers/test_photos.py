@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from clear_strategies import files
 from clear_strategies.core.images import to_bytes
 from clear_strategies.data.photo_files import Header
-from clear_strategies.data.readers import colmap, demo, photos, sfm
-from clear_strategies.data.readers.sfm import SfmSettings
+from clear_strategies.data.readers import colmap, demo, features, photos, sfm
+from clear_strategies.data.readers.features import SfmSettings
 from clear_strategies.errors import DataError
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -31,7 +31,7 @@ def test_poses_are_those_of_the_ground_truth(shared_data, tmp_path, monkeypatch,
     """Five views of fountain-P11 at 384x256: rotations within 1 degree, centres within 2 % of their largest offset. They count as
     large here; too few features are found at their own size, and they are enlarged after all.
     """
-    monkeypatch.setattr(sfm, "_LARGE", 0)
+    monkeypatch.setattr(features, "_LARGE", 0)
     folder = tmp_path / "photos"
     folder.mkdir()
     truth = colmap.read(shared_data / "strecha_fountain").frames[2:7]
@@ -147,7 +147,7 @@ def test_a_pycolmap_that_does_not_run_here_is_told_as_one_that_is_not_installed(
     with pytest.raises(
         DataError, match=r"cannot be imported \(Cannot import the C\+\+ backend\).*clear-strategies\[colmap\]"
     ):
-        sfm._pycolmap()
+        features.import_pycolmap()
 
 
 @pytest.mark.parametrize("swallowed", ["", "raise ImportError"])
@@ -162,14 +162,14 @@ def test_a_signal_while_pycolmap_is_imported_arrives_whatever_the_import_does_wi
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     try:
         with pytest.raises(KeyboardInterrupt):
-            sfm._pycolmap()
+            features.import_pycolmap()
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, before)
 
 
 def test_a_disk_that_is_too_full_for_the_features_is_told_before_colmap_ends_the_process(tmp_path, monkeypatch):
-    monkeypatch.setattr(sfm.shutil, "disk_usage", lambda _: SimpleNamespace(free=3 * 8192 * 320))
+    monkeypatch.setattr(features.shutil, "disk_usage", lambda _: SimpleNamespace(free=3 * 8192 * 320))
     with pytest.raises(OSError, match="No space left") as refused:
         photos.read(flat_photos(tmp_path / "photos", 3), tmp_path / "cache")
     assert refused.value.filename == str(tmp_path / "cache")
@@ -179,11 +179,11 @@ def test_a_disk_that_is_too_full_for_the_features_is_told_before_colmap_ends_the
 LIMITED = """
 import os, re, resource, signal
 from pathlib import Path
-from clear_strategies.data.readers import sfm
-sfm._pycolmap()
+from clear_strategies.data.readers import features, sfm
+features.import_pycolmap()
 used = 1024 * int(re.search(r"VmSize:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
 resource.setrlimit(resource.RLIMIT_AS, (used + (600 << 20), -1))
-sfm._require_addresses(Path("here"), 1)
+features._require_addresses(Path("here"), 1)
 try:
     sfm.reconstruct(Path("here"), {}, Path("model"), sfm.SfmSettings(480, 2000, False, 2, 0))
 except sfm.DataError as error:
@@ -310,16 +310,16 @@ def test_the_features_of_a_large_photo_begin_at_its_own_scale(tmp_path: Path) ->
     for number in range(2):
         picture = Image.fromarray(blobs).resize((320, 240), Image.Resampling.BICUBIC)
         picture.convert("RGB").save(tmp_path / "copies" / sfm.copy_name(number))
-    groups = {(320, 240, None, ()): [sfm.copy_name(0), sfm.copy_name(1)]}
+    groups = {features.CopyCamera(320, 240): [sfm.copy_name(0), sfm.copy_name(1)]}
     settings = SfmSettings(max_side=1600, max_features=8192, precise=False, threads=1, seed=0)
-    found = [sfm._find_features(pycolmap, tmp_path / f"{o}.db", groups, settings, octave=o) for o in (0, -1)]
+    found = [features.find_features(pycolmap, tmp_path / f"{o}.db", groups, settings, octave=o) for o in (0, -1)]
     assert 100 < found[0] < found[1]
 
 
 def test_no_photo_has_more_features_than_asked_for(tmp_path: Path) -> None:
     file = tmp_path / "database.db"
     found = database_of(file, {0: 3, 1: 7}, {})
-    sfm._keep_coarsest(pycolmap, file, 5)
+    features.keep_coarsest(pycolmap, file, 5)
     with pycolmap.Database.open(file) as database:
         for image, (keypoints, descriptors) in enumerate(found, start=1):
             assert np.array_equal(database.read_keypoints(image), keypoints[:5])

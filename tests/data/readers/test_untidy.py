@@ -193,7 +193,7 @@ Read = Callable[..., Capture]
 def of_photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Read]:
     """A folder of three photos, and what reads it."""
     model = captures.colmap_bin(tmp_path / "model") / "sparse" / "0"
-    monkeypatch.setattr(photos.sfm, "copy_name", lambda i: NAMES[i] if i < len(NAMES) else f"{i}.jpg")
+    monkeypatch.setattr(photos.features, "copy_name", lambda i: NAMES[i] if i < len(NAMES) else f"{i}.jpg")
 
     def reconstruct(root: Path, found: Mapping[Path, object], folder: Path, settings: object) -> None:
         for path in found:  # it makes copies of all of them
