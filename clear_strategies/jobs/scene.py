@@ -15,6 +15,7 @@ from clear_strategies.data.file_names import require_text
 from clear_strategies.data.prepare import prepare, truth_of
 from clear_strategies.data.priors import Bicubic, Ncnn, Prior, cached, network_of
 from clear_strategies.data.priors.ncnn import factors, missing_packages
+from clear_strategies.data.refined_poses import refined
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_settings import ViewSettings, within_limit
 from clear_strategies.errors import SettingError
@@ -39,6 +40,8 @@ class DataSettings:
 
     Args:
         reader: reads the capture; called after every setting has been checked.
+        refine_poses: refine poses and focal lengths by bundle adjustment (extra `colmap`), where a network, such as VGGT, or a
+            phone has estimated them.
         save_lr: write the LR images to this folder, for an external SR model, and stop.
         path, root, scene: what the files of conf/ refer to: the scene's folder, the folder of the scenes' folders, and the
             name of one of them.
@@ -48,6 +51,7 @@ class DataSettings:
     views: ViewSettings = field(default_factory=ViewSettings)
     cloud: CloudSettings = field(default_factory=CloudSettings)
     save_lr: str | None = None
+    refine_poses: bool = False
     path: str | None = _variable()
     root: str | None = _variable()
     scene: str | None = _variable()
@@ -111,7 +115,7 @@ def read(data: DataSettings, prior: PriorSettings | None) -> tuple[Capture, View
     Args:
         prior: None: images of another program, which super-resolves what `save_lr` writes.
     """
-    capture = data.reader()
+    capture = refined(data.reader()) if data.refine_poses else data.reader()
     require_text((capture.name, *(frame.name for frame in capture.frames), *capture.unplaced))
     placed, photos = len(capture.frames), len(capture.frames) + len(capture.unplaced)
     if placed < _ENOUGH * photos:

@@ -3,6 +3,7 @@
 import math
 import re
 import shutil
+import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -343,6 +344,22 @@ def colmap4(root: Path) -> None:
     assert {"rigs.bin", "frames.bin"} <= {file.name for file in (root / "sparse/0").iterdir()}
 
 
+def vggt(root: Path) -> None:
+    """A model in sparse/ itself, with a pinhole for each photo, and a cloud beside it."""
+    folder = tiny.colmap_bin(root) / "sparse"
+    for file in (folder / "0").iterdir():
+        file.rename(folder / file.name)
+    (folder / "0").rmdir()
+    count, pinhole = len(NAMES), tiny.MODEL_NUMBERS["PINHOLE"]
+    cameras = [struct.pack("<iiQQ4d", i + 1, pinhole, WIDTH, HEIGHT, FOCAL, FOCAL, 8, 6) for i in range(count)]
+    (folder / "cameras.bin").write_bytes(struct.pack("<Q", count) + b"".join(cameras))
+    images = (folder / "images.bin").read_bytes()
+    for i, name in enumerate(NAMES):
+        images = images.replace(struct.pack("<i", 1) + name.encode(), struct.pack("<i", i + 1) + name.encode())
+    (folder / "images.bin").write_bytes(images)
+    write_points(folder / "points.ply", torch.ones(2, 3), torch.zeros(2, 3))
+
+
 def reality_capture(root: Path) -> None:
     """Capital letters, a byte order mark, lines as on Windows, and the photos beside them."""
     tiny.colmap_txt(root)
@@ -395,9 +412,9 @@ def blender_nerf(root: Path) -> None:
 WRITE: dict[str, Callable[[Path], object]] = {
     "COLMAP 3": tiny.colmap_bin, "COLMAP 4": colmap4, "RealityCapture": reality_capture, "Metashape": of_each_frame,
     "Polycam": of_each_frame, "Record3D": of_each_frame, "nerfstudio": nerfstudio_own, "instant-ngp": instant_ngp,
-    "BlenderNeRF": blender_nerf, "LLFF": tiny.llff,
+    "BlenderNeRF": blender_nerf, "LLFF": tiny.llff, "VGGT": vggt,
 }  # fmt: skip
-POINTS = ("COLMAP 3", "COLMAP 4", "RealityCapture", "nerfstudio", "BlenderNeRF", "LLFF")
+POINTS = ("COLMAP 3", "COLMAP 4", "RealityCapture", "nerfstudio", "BlenderNeRF", "LLFF", "VGGT")
 
 
 def test_the_table_has_every_tool(tmp_path: Path) -> None:
