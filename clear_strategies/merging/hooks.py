@@ -93,7 +93,8 @@ class Hooks:
         self.comparing = [s for s in strategies if overrides(s, "compare")]
         self.regularizers = [s for s in strategies if overrides(s, "regularize")]
         self.showing = [s for s in strategies if overrides(s, "extra_views")]
-        self._answering = {hook: _only(strategies, hook) for hook in _ONE_ANSWER}
+        self._pulled_at: int | None = None  # the last iteration in which `regularized` found a gradient
+        self._answering = {hook: _only(strategies, hook) for hook in ONE_ANSWER}
         for s in strategies:
             if not any(overrides(s, hook) for hook in (*_ONE_ANSWER, "correct", *_ALL_ANSWER)):
                 _log.warning("%s implements no hook; it has no effect.", type(s).__name__)
@@ -261,7 +262,7 @@ class Hooks:
         Args:
             finite: check also that the answers are finite.
         """
-        total = Grads()
+        total, self._pulled_at = Grads(), None
         for s in self.regularizers:
             answer = s.regularize(params, iteration(t))
             if answer is None:
@@ -273,8 +274,11 @@ class Hooks:
 
     @apart_from_the_loop
     def pulls(self, params: Mapping[str, Tensor], t: int) -> bool:
-        """Return True if a strategy adds a gradient at t, which moves even Gaussians that no view draws."""
-        return any(s.regularize(params, t) is not None for s in self.regularizers)
+        """Return True if a strategy adds a gradient at t, which moves even Gaussians that no view draws. One that has done so is
+        not asked again, since it may count its calls.
+        """
+        return self._pulled_at == t or any(s.regularize(params, t) is not None for s in self.regularizers)
+            self._pulled_at = t
 
     @apart_from_the_loop
     def draw(self, t: int, means: Float[Tensor, "N 3"], enlarged: Callable[[Camera, int], Photo]) -> None:

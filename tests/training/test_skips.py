@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from clear_strategies import SVS, Conductor, Objective
+from clear_strategies import SVS, Conductor, Objective, Strategy
 from clear_strategies.core import images
 from clear_strategies.merging.skips import PLATEAU_LOSS, Plateau, SkipPolicy, Skips
 from clear_strategies.schedules import Ramp, WarmupDecay, scaled
@@ -198,8 +198,8 @@ def faint(state, share: float):
     return torch.tensor([i for i in range(n) if i not in rows])
 
 
-def settled(*names: str, undrawn: float = 0.05):
-    state = start(names, more=[] if "svs" in names else [SVS(Ramp(0.2, "constant"), looks=0)])
+def settled(*names: str, undrawn: float = 0.05, more=()):
+    state = start(names, more=more or ([] if "svs" in names else [SVS(Ramp(0.2, "constant"), looks=0)]))
     state.conductor.skips = SkipPolicy(Skips(undrawn=undrawn))
     for _ in range(13):
         iterate(state, toy.RASTERIZER)
@@ -234,6 +234,23 @@ def test_gaussians_that_no_view_draws_are_removed_and_the_pictures_stay():
     assert len(state.field) == len(kept)
     for name, x in state.checkpoint({}).tensors.items():
         assert torch.equal(x, resumed.checkpoint({}).tensors[name]), name
+
+
+class Counts(Strategy):
+    """Counts how often it is asked for a gradient."""
+
+    def regularize(self, params, t):
+        self.cache["asked"] = self.cache.get("asked", 0) + 1
+        return {"means": 1e-3 * params["means"]}
+
+
+def test_a_strategy_whose_gradient_keeps_them_is_asked_once_in_an_iteration():
+    state = settled(more=[Counts(), SVS(Ramp(0.2, "constant"), looks=0)])
+    faint(state, 0.4)
+    n, counts = len(state.field), state.conductor.strategies[0]
+    before = counts.cache["asked"]
+    iterate(state, toy.RASTERIZER)
+    assert (counts.cache["asked"], len(state.field)) == (before + 1, n)
 
 
 def test_they_stay_while_the_structure_changes_or_where_they_may_return():
