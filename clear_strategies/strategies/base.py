@@ -87,7 +87,8 @@ class Strategy:
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
-        if taken := _OWN_NAMES & annotations_of(cls).keys():
+        of_all = {name for name in vars(Strategy) if name[0] != "_"} | _OWN_NAMES
+        if taken := of_all & annotations_of(cls).keys():
             raise TypeError(
                 f"{cls.__name__}: a setting must not be called {min(taken)}, which every strategy has already."
             )

@@ -544,8 +544,9 @@ def test_what_a_checkpoint_could_not_give_back_is_refused(where, stored, message
 
 def test_settings_of_taken_names_are_refused():
     type("Mine", (Strategy,), {"__annotations__": {"begin": int}})
-    with pytest.raises(TypeError, match="a setting must not be called seed"):
-        type("Mine", (Strategy,), {"__annotations__": {"seed": int}})
+    for taken in ("seed", "gate", "log"):  # a number in place of a hook could not be called
+        with pytest.raises(TypeError, match=f"a setting must not be called {taken}"):
+            type("Mine", (Strategy,), {"__annotations__": {taken: int}})
 
 
 def field_and_view(dtype=torch.float64, degree=1):
