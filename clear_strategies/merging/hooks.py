@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from numbers import Real
-from types import MappingProxyType
 from typing import Any, Final
 
 import torch
@@ -297,12 +296,12 @@ class Hooks:
     @apart_from_the_loop
     def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
         """After the optimizer steps of an iteration."""
-        params = MappingProxyType(params)  # to replace an entry would have no effect
         for s in self.strategies:
-            asked = params if overrides(s, "after_step") else {}
+            asked = dict(params) if overrides(s, "after_step") else {}
             before = {name: _memory(p) for name, p in asked.items()}
-            s.after_step(params, step)
-            if moved := [name for name, p in asked.items() if _memory(p) != before[name]]:
+            s.after_step(asked, step)  # `asked[name] += …` stores the same tensor again
+            of_own = (name for name in {**asked, **before} if asked.get(name) is not params.get(name))
+            if moved := [*of_own, *(name for name, memory in before.items() if _memory(params[name]) != memory)]:
                 way = f"{moved[0]} in place, by {moved[0]}.copy_(…), {moved[0]} += … or {moved[0]}[…] = …"
                 raise AnswerError(f"{type(s).__name__}.after_step() must change {way}; other memory changes nothing.")
             require_stored(s, params)
