@@ -42,6 +42,8 @@ def announce(conductor: Conductor, views: Sequence[View], host: Host) -> None:
     for s in conductor.strategies:
         if (prepared := s.summary()) is not None:
             _log.info("%s: %s.", type(s).__name__, prepared)
+    λ = conductor.objective.lambda_hr
+    conductor.warn_without_effect(0.0 if start is None else max(λ.peak, λ.final))
     if not conductor.decorated and any(view.factor > 1 for view in views):
         _log.warning(
             "%s has no effect: the views were made without it. Make them with sr=conductor.prior(sr).",

@@ -34,6 +34,8 @@ from clear_strategies.strategies.answers import (
     rows_like,
 )
 from clear_strategies.strategies.base import (
+    ALL_ANSWER,
+    ONE_ANSWER,
     RunFacts,
     Scale,
     Strategy,
@@ -49,8 +51,6 @@ from rasterizers.modes import apart_from_the_loop
 
 _log = logging.getLogger(__name__)
 
-_ONE_ANSWER: Final = ("densifier", "background", "gate", "observe", "route", "reconcile", "score")
-_ALL_ANSWER: Final = ("compare", "regularize", "draw", "extra_views", "may_densify", "after_step")
 _ALSO_BY: Final = {"reconcile": ("correct",)}  # hooks that may be overridden instead
 
 
@@ -95,7 +95,7 @@ class Hooks:
         self._pulled_at: int | None = None  # the last iteration in which `regularized` found a gradient
         self._answering = {hook: _only(strategies, hook) for hook in ONE_ANSWER}
         for s in strategies:
-            if not any(overrides(s, hook) for hook in (*_ONE_ANSWER, "correct", *_ALL_ANSWER)):
+            if not any(overrides(s, hook) for hook in (*ONE_ANSWER, "correct", *ALL_ANSWER)):
                 _log.warning("%s implements no hook; it has no effect.", type(s).__name__)
             for hook, name in misspelled(type(s)).items():
                 _log.warning("%s.%s() is no hook: nothing calls it. There is %s().", type(s).__name__, name, hook)
@@ -124,6 +124,15 @@ class Hooks:
             if overrides(s, "on_views"):
                 with self.work_log.stage("views prepared"):
                     s.on_views(views)
+
+    def warn_without_effect(self, lambda_hr: float) -> None:
+        """Log the strategies that change nothing, where the largest λ_HR(t) of the run is this."""
+        for s in self.strategies:
+            why = s.without_effect(
+                lambda_lr=self.objective.lambda_lr, lambda_hr=lambda_hr, lambda_hf=self.objective.lambda_hf
+            )
+            if why is not None:
+                _log.warning("%s has no effect: %s.", type(s).__name__, why)
 
     def trains(self, run: RunFacts | None) -> bool:
         """Return True if this conductor and its strategies have begun `run`, and no other one since."""
@@ -267,6 +276,7 @@ class Hooks:
             if answer is None:
                 self.work_log.skip("regularize", "it adds nothing yet")
                 continue
+            self._pulled_at = t
             g = rows_like(s, "regularize", answer, params, "of the parameters", finite=finite)
             total = g if not total else total + g
         return total
@@ -277,7 +287,6 @@ class Hooks:
         not asked again, since it may count its calls.
         """
         return self._pulled_at == t or any(s.regularize(params, t) is not None for s in self.regularizers)
-            self._pulled_at = t
 
     @apart_from_the_loop
     def draw(self, t: int, means: Float[Tensor, "N 3"], enlarged: Callable[[Camera, int], Photo]) -> None:

@@ -104,12 +104,7 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[s
         if (summary := s.summary()) is not None:
             lines[name.replace("_", " ")] = summary
     lines["skipped"] = "; ".join(_skipped(state)) or "nothing"
-    objective = conductor.objective
-    largest = max(map(objective.lambda_hr, range(1, settings.iterations + 1)))
-    for s in conductor.strategies:
-        why = s.without_effect(lambda_lr=objective.lambda_lr, lambda_hr=largest, lambda_hf=objective.lambda_hf)
-        if why is not None:
-            _log.warning("%s has no effect: %s.", type(s).__name__, why)
+    conductor.warn_without_effect(max(map(conductor.objective.lambda_hr, range(1, settings.iterations + 1))))
     short = {label: lines[label] for label in _SHORT if label in lines}
     details = {label: text for label, text in lines.items() if label not in short}
     short["more"] = f"{len(details)} lines in run.log, or here with -v"

@@ -33,6 +33,10 @@ from rasterizers.native import empty_for
 _ALIKE: Final = 0.85  # "regularise" to "regularize" 0.9, "densify" to "densifier" 0.75
 _OWN_NAMES: Final = {"state", "run_state", "cache", "logs", "of_run", "device", "seed", "lambda_hr", "splats"}
 
+ONE_ANSWER: Final = ("densifier", "background", "gate", "observe", "route", "reconcile", "score")
+"""Hooks that one strategy of a run may override; `correct` may be overridden in place of `reconcile`."""
+ALL_ANSWER: Final = ("compare", "regularize", "draw", "extra_views", "may_densify", "after_step")
+
 Scale = Literal["lr", "hr"]
 
 Logged = Number | Callable[[], Number]
@@ -246,12 +250,20 @@ class Strategy:
         return None
 
     def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
-        """Why the strategy changes nothing with these loss weights; None if it has an effect.
+        """Why the strategy changes nothing with these loss weights; None if it has an effect. The default looks at which hooks it
+        overrides.
 
         Args:
             lambda_hr: the largest λ_HR(t) of the run.
             lambda_hf: the share of the high-frequency loss in it.
         """
+        own = {hook for hook in (*ONE_ANSWER, "correct", *ALL_ANSWER) if overrides(self, hook)}
+        if own and lambda_hr == 0 and own <= {"route", "reconcile", "correct"}:
+            return "lambda_HR is 0 throughout"
+        if lambda_hf == 0 and own == {"route"}:
+            return "lambda_HF is 0, and it routes the high-frequency loss alone"
+        if lambda_lr == 0 and {"extra_views"} <= own <= {"extra_views", "draw"}:
+            return "it is the LR loss that its pictures are trained by, and lambda_lr is 0"
         return None
 
     @property

@@ -143,9 +143,6 @@ class PseudoViews(Strategy):
         wide = f"{borders} with a field {self.border:g} times as wide, " if borders else ""
         return f"{moved}{wide}one every {'iteration' if self.every == 1 else f'{self.every} iterations'}"
 
-    def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
-        return "it is the LR loss that pseudo views are trained by, and lambda_lr is 0" if lambda_lr == 0 else None
-
 
 def _depths(views: Sequence[View]) -> dict[str, DepthMap]:
     """The depth of each photo: that of its view or, if no view has depth, from stereo."""

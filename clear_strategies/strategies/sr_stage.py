@@ -86,6 +86,3 @@ class SRStage(Strategy):
         if not self.cache.get("views"):
             return None
         return f"SR images from t={self.start + 1} on, and {self.count} enlarged pictures of the field by cameras aside"
-
-    def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
-        return "it is the LR loss that its pictures are trained by, and lambda_lr is 0" if lambda_lr == 0 else None

@@ -10,7 +10,7 @@ import torch
 from torch.utils.checkpoint import checkpoint
 
 import rasterizers
-from clear_strategies import P2G, SVS, Conductor, PseudoViews, RandomBackground, Strategy, View
+from clear_strategies import GCO, P2G, SVS, Conductor, PseudoViews, RandomBackground, Strategy, View
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.schedules import Ramp
 from integration import HostError
@@ -563,6 +563,12 @@ def test_a_strategy_that_compares_images_hears_that_the_loss_at_lr_is_the_hosts(
     caplog.clear()
     started()
     assert "compare()" not in caplog.text
+
+
+@pytest.mark.parametrize(("objective", "warned"), [(WITHOUT_HR, True), (HR_FROM_START, False)])
+def test_a_strategy_without_effect_is_told(objective, warned, caplog):
+    started(conductor=Conductor(GCO(), objective=objective))
+    assert ("GCO has no effect: lambda_HR is 0 throughout." in caplog.text) == warned
 
 
 @pytest.mark.parametrize("own_background", [False, True])
