@@ -106,6 +106,7 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
         raw = {name: getattr(gaussians, name) for name in PARAMETERS}
         field = GaussianField(raw | {"detail": torch.zeros_like(gaussians.means)})
         field.degree = field.max_degree
+        field.constrain()  # else scales of e⁵⁰ overflow
         settings = {} if gaussians.antialiased else {"kernel": 0.3, "antialiased": False}
         folder, above, source = ply.parent, _ABOVE, str(ply)
         name = folder.name if ply.name == PLY else ply.stem

@@ -12,7 +12,7 @@ import torch
 import rasterizers
 from clear_strategies.commands import export, render, view
 from clear_strategies.data.photo_files import read_header, read_image
-from clear_strategies.data.ply import read_gaussians
+from clear_strategies.data.ply import read_gaussians, write_gaussians
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import open_splat
 from clear_strategies.outputs.results import export_ply
@@ -85,6 +85,16 @@ def test_a_lone_ply_file_has_an_upright_camera_that_sees_it(saved_run, tmp_path)
     points = field.means.data.double() @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     u = points[:, 0] / points[:, 2] * camera.fx + camera.cx
     assert float(((u > 0) & (u < camera.width) & (points[:, 2] > 0)).double().mean()) > 0.8
+
+
+@pytest.mark.parametrize(("name", "value"), [("scales", 50.0), ("scales", -150.0), ("opacities", -500.0)])
+def test_a_ply_file_of_numbers_that_overflow_is_drawn_and_written(name, value, saved_run, tmp_path):
+    ply = read_gaussians(saved_run[0] / "point_cloud.ply")
+    write_gaussians(tmp_path / "a.ply", replace(ply, **{name: torch.full_like(getattr(ply, name), value)}))
+    splat = open_splat(tmp_path / "a.ply")
+    assert splat.painter.color(splat.poses()[0]).isfinite().all()
+    export.main([str(tmp_path / "a.ply"), "--out", str(tmp_path / "b.ply")])
+    assert len(read_gaussians(tmp_path / "b.ply")) == len(ply)
 
 
 def test_the_inria_layout_of_a_model_is_found(saved_run, tmp_path):
