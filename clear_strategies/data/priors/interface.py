@@ -128,7 +128,8 @@ class Cached:
             else:
                 _log.debug("%s: SR image from the cache (%s).", name, self.label)
                 return result
-        result = images.quantize(self.prior(name, lr, factor)).contiguous()  # as read_image's: strides order sums
+        image = super_resolved(self.prior, name, lr, factor).image.to(lr)
+        result = images.quantize(image).contiguous()  # as read_image's: strides order sums
         try:
             write_png(file, result)
         except OSError as error:  # without the cache the run is slower, not wrong

@@ -52,9 +52,12 @@ def test_real_networks_do_on_fern_what_is_known_of_them_without_seams(shared_dat
     ],
     ids=["array", "bytes", "alpha", "size"],
 )
-def test_what_is_no_sr_image_is_refused_by_the_name_of_its_view(made, told):
-    with pytest.raises(DataError, match=f"a: SR image: {told}"):
-        super_resolved(lambda name, lr, factor: made, "a", torch.zeros(2, 3, 3), 4)
+def test_what_is_no_sr_image_is_refused_by_the_name_of_its_view_and_not_cached(made, told, tmp_path, monkeypatch):
+    monkeypatch.setattr(Counting, "__call__", lambda self, name, lr, factor: made)
+    for prior in (Counting(), Cached(Counting(), tmp_path)):
+        with pytest.raises(DataError, match=f"a: SR image: {told}"):
+            super_resolved(prior, "a", torch.zeros(2, 3, 3), 4)
+    assert not [*tmp_path.iterdir()]
 
 
 # ---- SR images from a folder: found by name, refused if missing, ambiguous or of another size
