@@ -244,7 +244,7 @@ def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: 
     below = [0 if part is None else zoom * (part[0].stop - part[0].start) + _GAP for part in parts]  # their heights
     larger = max(1.0, max(len(columns) * cell_w, len(rows) * cell_h + sum(below)) / _SCREEN)
     line = round(_LINE * larger)
-    heads = [textwrap.wrap(column, round(cell_w / 7 / larger)) or [""] for column in columns]
+    heads = [textwrap.wrap(column, round(cell_w / 7 / larger) or 1) or [""] for column in columns]
     lefts = [2 * line + i * (cell_w + _GAP) for i in range(len(columns) + 1)]  # the last is the end of the images
     top, pitch = (4 + max(map(len, heads))) * line, cell_h + 2 * line + _GAP
     tops = [top + j * pitch + sum(below[:j]) for j in range(len(rows) + 1)]
@@ -280,7 +280,7 @@ def write_tiles(path: Path, tiles: Mapping[str, np.ndarray], title: str, columns
 
     h, w = (max(image.shape[axis] for image in tiles.values()) for axis in (0, 1))
     cell_h, cell_w = (round(magnification(h, w) * size) for size in (h, w))
-    heads = ["\n".join(textwrap.fill(line, cell_w // 6) for line in name.splitlines()) for name in tiles]
+    heads = ["\n".join(textwrap.fill(line, cell_w // 6 or 1) for line in name.splitlines()) for name in tiles]
     head = (2 + max(name.count("\n") for name in heads)) * _LINE
     width = _GAP + min(columns, len(tiles)) * (cell_w + _GAP)
     height = 2 * _LINE + -(-len(tiles) // columns) * (head + cell_h) + _GAP

@@ -6,7 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from clear_strategies.outputs import figures
-from clear_strategies.outputs.figures import SheetRow, magnification, window, write_contact_sheet
+from clear_strategies.outputs.figures import SheetRow, magnification, window, write_contact_sheet, write_tiles
 from tests.helpers.image_files import array, holds, read
 
 
@@ -31,6 +31,9 @@ def row(name: str, seed: int, *, truth: bool = True, size: tuple[int, int] = (40
 def test_huge_images_are_reduced_and_truth_and_error_are_shown_where_they_are_known(tmp_path: Path) -> None:
     write_contact_sheet(tmp_path / "sheet.png", [row("a$1_$.png", 0, size=(90, 2000))], "scan $20_$")
     assert read(tmp_path / "sheet.png").shape[1] < 4 * 700
+    strip = row("strip", 0, size=(1600, 12))
+    write_contact_sheet(tmp_path / "strip.png", [strip], "narrower than a letter")
+    write_tiles(tmp_path / "tiles.png", strip.images, "narrower than a letter", columns=3)
     unknown, a, b = row("a", 0, truth=False), row("a", 0), row("b", 10)
     for name, rows in {"none": [unknown], "some": [unknown, b], "all": [a, b]}.items():
         write_contact_sheet(tmp_path / f"{name}.png", rows, "scene")
