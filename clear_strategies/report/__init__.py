@@ -35,6 +35,7 @@ __all__ = ["FinishedRun", "collect", "compare", "layout", "main", "markdown", "n
 
 _log = logging.getLogger(__name__)
 
+_DRAWN: Final = 18  # methods in the pictures of a scene, as many as lines can be told apart
 _LONGEST: Final = 60  # characters of a scene in the name of a file
 
 
@@ -75,7 +76,10 @@ def write(runs: Sequence[FinishedRun], out: Path, against: str | None = None) ->
         if rows["average"].any():
             sections.insert(0, section)
             continue
-        shown = dict(zip(rows["method"], rows["run"], strict=True))  # the first of several seeds
+        drawn = rows.sort_values(["reference", "psnr"], ascending=False, kind="stable").head(_DRAWN).sort_index()
+        shown = dict(zip(drawn["method"], drawn["run"], strict=True))  # the first of several seeds
+        if len(drawn) < len(rows):
+            _log.info("%s: the pictures show the reference and the %d best others of %d.", scene, _DRAWN - 1, len(rows))
         if _compare_renders(out / f"comparison_{name}.png", scene, shown):
             pictures.append(f"comparison_{name}.png")
         pictures.append(f"curves_{name}.png")

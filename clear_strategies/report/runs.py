@@ -122,6 +122,8 @@ def collect(folders: Iterable[Path]) -> list[FinishedRun]:
     seen, runs = set[Path](), list[FinishedRun]()
     for folder in folders:
         in_folder = list[FinishedRun]()
+        if not folder.is_dir():
+            _log.warning("%s: is not there, or is a file.", folder)
         for path in sorted(folder.rglob(FINISHED)):
             if (run := path.parent.resolve()) in seen:
                 continue

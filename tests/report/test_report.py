@@ -97,9 +97,10 @@ def test_the_command_prints_the_table_on_an_ascii_terminal_and_does_not_import_h
     assert r"| \u5ead\u9662    | gco" in done.stdout
 
 
-def test_without_runs_there_is_no_report(tmp_path):
+def test_without_runs_there_is_no_report(tmp_path, caplog):
     with pytest.raises(DataError, match="there is no finished run here: give the folder of a run or of a sweep"):
         report.collect([tmp_path, tmp_path / "absent"])
+    assert f"{tmp_path / 'absent'}: is not there" in caplog.text
 
 
 def test_empty_columns_are_left_out_and_a_bar_in_a_name_does_not_break_the_table(tmp_path: Path) -> None:
@@ -107,6 +108,17 @@ def test_empty_columns_are_left_out_and_a_bar_in_a_name_does_not_break_the_table
     header, _, line = table_of(tmp_path).splitlines()[:3]
     assert not {"conflict", "Δ", "best"} & set(header.split())
     assert "a\\|b" in line
+
+
+def test_the_pictures_of_many_methods_show_the_reference_and_the_best(tmp_path, monkeypatch):
+    for number in range(25):
+        make_run(tmp_path / f"{number:02}", f"+strategies.gco.tolerance={number}", psnr=30.0 - abs(number - 20))
+    drawn = []
+    monkeypatch.setattr(report, "_compare_renders", lambda path, scene, runs: drawn.extend(runs))
+    monkeypatch.setattr(report, "write_curves", lambda path, histories, title: drawn.append(list(histories)))
+    report.main([str(tmp_path)])
+    best = [f"gco, +strategies.gco.tolerance={number}" for number in (0, *range(8, 25))]
+    assert drawn == [*best, best]
 
 
 # ---- A comparison enlarges the window where runs differ; charts draw what was measured
