@@ -89,7 +89,8 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
 
     @property
     def address(self) -> str:
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+        host = self.server.get_host()
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
 
     def get_camera_state(self, client: Any) -> Any:
         """The camera of a browser, its aspect clamped; a default one if viser knows none."""

@@ -87,7 +87,7 @@ def test_a_lone_ply_file_has_an_upright_camera_that_sees_it(saved_run, tmp_path)
     assert float(((u > 0) & (u < camera.width) & (points[:, 2] > 0)).double().mean()) > 0.8
 
 
-@pytest.mark.parametrize(("name", "value"), [("scales", 50.0), ("scales", -150.0), ("opacities", -500.0)])
+@pytest.mark.parametrize(("name", "value"), [("scales", 50.0), ("opacities", -500.0)])
 def test_a_ply_file_of_numbers_that_overflow_is_drawn_and_written(name, value, saved_run, tmp_path):
     ply = read_gaussians(saved_run[0] / "point_cloud.ply")
     write_gaussians(tmp_path / "a.ply", replace(ply, **{name: torch.full_like(getattr(ply, name), value)}))

@@ -94,6 +94,12 @@ def test_the_viewer_shows_what_is_measured_or_its_depth(server, saved_run, tmp_p
         viewer.close()
 
 
+@pytest.mark.parametrize(("host", "named"), [("::1", "http://[::1]:8080"), ("0.0.0.0", "http://0.0.0.0:8080")])  # noqa: S104
+def test_the_address_is_one_that_a_browser_opens(server, host, named):
+    serving = SimpleNamespace(get_host=lambda: host, get_port=lambda: 8080)
+    assert server.SplatViewer.address.fget(SimpleNamespace(server=serving)) == named
+
+
 def test_missing_libraries_are_named(monkeypatch):
     monkeypatch.setattr(exit_codes, "find_spec", lambda name: None if name == "viser" else object())
     with pytest.raises(SettingError, match=r"the viewer needs viser: pip install 'clear-strategies\[view\]'"):
