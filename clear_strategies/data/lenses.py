@@ -43,8 +43,7 @@ _SAMPLES: Final = 65  # a side
 _MOST_ZOOM: Final = 2.0
 _ZOOMS: Final = 36
 _WIDEST: Final = math.tan(math.radians(70))
-"""The tangent of the angle between an undistorted photo's middle and its corners, at most. There a pixel is already nine times as
-long as in the middle."""
+"""The tangent of the angle between an undistorted photo's middle and its corners, at most: pixels are then 8 times as long."""
 
 
 @dataclass(frozen=True, slots=True)

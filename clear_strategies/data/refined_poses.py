@@ -35,12 +35,9 @@ _log = logging.getLogger(__name__)
 _ROUNDS: Final = (0.04, 0.016, 0.008, 0.004)
 """The largest reprojection error of a point in each round, in longer sides of the largest copy."""
 _DEGREES: Final = 500.0  # largest angle between a point and a ray to it, per that error
-_SQUARE: Final = (
-    0.05  # relative difference of fx and fy, up to which pixels are square, and one focal length is adjusted
-)
-_ONE_LENS: Final = (
-    0.1  # relative difference of the focal lengths of photos of one size, up to which they share a camera
-)
+# Relative differences of focal lengths, up to which …
+_SQUARE: Final = 0.05  # … those of x and y are one, because pixels are square
+_ONE_LENS: Final = 0.1  # … photos of one size share a camera
 _FEWEST_POINTS: Final = 30  # of a photo, from which its pose is adjusted
 _VERSION: Final = "four rounds, shared focal lengths"
 
@@ -187,8 +184,10 @@ def _with_model(capture: Capture, folder: Path) -> Capture:
             frames.append(replace(frame, sfm_id=None))
             continue
         lens, given = model.lenses[image.camera], frame.camera
-        fx, fy = lens.fx * given.width / lens.width, lens.fy * given.height / lens.height
-        camera = replace(given, world_to_camera=image.pose, fx=fx, fy=fy)
+        x, y = given.width / lens.width, given.height / lens.height
+        camera = replace(
+            given, world_to_camera=image.pose, fx=x * lens.fx, fy=y * lens.fy, cx=x * lens.cx, cy=y * lens.cy
+        )
         frames.append(_seen_by(frame, camera, image.id))
         turns.append(_angle(given.world_to_camera, image.pose))
     if kept := [frame.name for i, frame in enumerate(capture.frames) if copy_name(i) not in adjusted]:
