@@ -5,7 +5,7 @@ Files:
 
 - report.md, report.csv: the table, and the paper's numbers beside ours if the runs are of its data sets
 - report.html: the tables and pictures of all scenes; it needs the pictures beside it, and no network
-- comparison_SCENE.png: one test view of all methods, enlarged where they differ most
+- comparison_SCENE.png: one test view of up to 18 methods, enlarged where they differ most
 - curves_SCENE.png: the columns of history.csv, over iterations and over training time
 """
 
