@@ -74,11 +74,11 @@ def load(name: str = "auto", *, preset: str | None = None, **settings: Any) -> R
     return rasterizer
 
 
-def fastest(device: str | None = None) -> str:
+def fastest(device: str | torch.device | None = None) -> str:
     """The name of the fastest backend on this machine.
 
     Args:
-        device: "cpu" or "cuda", where the splats' tensors are; None: any.
+        device: where the splats' tensors are; None: any.
 
     Raises:
         BackendUnavailable: none draws tensors there.
@@ -86,9 +86,9 @@ def fastest(device: str | None = None) -> str:
     for name in names():
         with suppress(BackendUnavailable):
             backend = load(name)
-            if device is None or device in backend.traits.devices:
+            if device is None or torch.device(device).type in backend.traits.devices:
                 return name
-    raise BackendUnavailable(f"no rasterizer draws tensors on {device!r}; move the splats to 'cpu' or 'cuda'.")
+    raise BackendUnavailable(f"no rasterizer draws tensors on '{device}'; move the splats to 'cpu' or 'cuda'.")
 
 
 def for_device(name: str, device: str) -> dict[str, str]:

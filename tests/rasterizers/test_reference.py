@@ -77,7 +77,8 @@ def test_batches_do_not_change_the_picture(lanes):
 def test_a_preset_sets_the_cut_offs_and_where_no_rasterizer_draws_the_error_says_so():
     assert rasterizers.available()["torch"] is None
     with pytest.raises(rasterizers.BackendUnavailable, match="no rasterizer draws tensors on 'mps'; move the splats"):
-        rasterizers.fastest("mps")
+        rasterizers.fastest(torch.device("mps"))
+    assert rasterizers.fastest(torch.device("cpu")) == rasterizers.fastest("cpu:0") == rasterizers.fastest("cpu")
     assert rasterizers.load("torch", preset="fast") == rasterizers.load("torch")
     cuts = []
     for name, preset in PRESETS.items():
