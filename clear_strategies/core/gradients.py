@@ -158,6 +158,12 @@ def _plus_rows(
     return torch.addcmul(a, b, weight.to(b).view(-1, *[1] * (b.dim() - 1)))
 
 
+def in_our_shapes(tensors: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    """The same tensors by attribute, with opacities as [N], which 3DGS and nerfstudio keep as [N, 1]."""
+    o = tensors.get("opacities")
+    return tensors if o is None or o.shape[1:] != (1,) else Grads({**tensors, "opacities": o[:, 0]})
+
+
 def scale_rows(value: Float[Tensor, "N ..."], weight: float | Float[Tensor, " N"]) -> Float[Tensor, "N ..."]:
     """Each row times its weight."""
     if isinstance(weight, Tensor):

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from clear_strategies.core.deferred import Scalar
 from clear_strategies.core.evidence import Evidence
+from clear_strategies.core.gradients import in_our_shapes
 from clear_strategies.core.view import View
 
 
@@ -23,7 +24,7 @@ class Step:
         view: the photo and the SR image of this iteration, each with its camera.
         visible: the Gaussians that the HR render shows, [N]; None in an iteration without HR.
         evidence: the answer of `Strategy.observe`; None before it, and where no strategy gives one.
-        params: raw parameters by attribute (log scales, logit opacities), to read; empty where the structure has changed since.
+        params: raw parameters by attribute (log scales, logit opacities [N]), to read; empty if the structure has changed since.
         looked_up: if the iteration is replayed, what `Strategy.looked_up` returned for the view; None: the strategy calls it.
     """
 
@@ -33,6 +34,9 @@ class Step:
     evidence: Evidence | None = None
     params: Mapping[str, Tensor] = field(default_factory=dict)
     looked_up: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "params", in_our_shapes(self.params))
 
     def copied(self) -> Step:
         """The same step with copies of its tensors."""

@@ -18,7 +18,7 @@ from clear_strategies.core.checks import is_color
 from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.evidence import Evidence
-from clear_strategies.core.gradients import Grads, ScreenGradients, Shot
+from clear_strategies.core.gradients import Grads, ScreenGradients, Shot, in_our_shapes
 from clear_strategies.core.step import Losses, Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.core.work_log import WorkLog
@@ -244,11 +244,12 @@ class Hooks:
         Raises:
             AnswerError: the answer is not valid.
         """
+            answer = s.correct(in_our_shapes(g_lr), in_our_shapes(g_hr), step)
         s = self._answering["reconcile"]
         if overrides(s, "correct"):
             g_lr, g_hr = both()
             # By attributes of g_HR; those that the answer leaves out are 0.
-            return rows_like(s, "correct", s.correct(g_lr, g_hr, step), g_hr, "of g_HR", finite=finite)
+            return rows_like(s, "correct", answer, g_hr, "of g_HR", finite=finite)
         weights, (n, groups), at = s.reconcile(products, step), products.dot.shape, products.dot.device
         if not isinstance(weights, Weights):
             refuse(s, "reconcile", "Weights(keep, remove)", weights)
@@ -272,7 +273,7 @@ class Hooks:
         """
         total, self._pulled_at = Grads(), None
         for s in self.regularizers:
-            answer = s.regularize(params, iteration(t))
+            answer = s.regularize(in_our_shapes(params), iteration(t))
             if answer is None:
                 self.work_log.skip("regularize", "it adds nothing yet")
                 continue
@@ -302,6 +303,7 @@ class Hooks:
         with self.work_log.stage("pictures of extra views"):  # a pseudo view is made when it is first asked for
             return [extra for s in self.showing for extra in _extra_views(s, t)]
 
+        params = in_our_shapes(params)
     @apart_from_the_loop
     def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
         """After the optimizer steps of an iteration."""
@@ -363,7 +365,8 @@ class Hooks:
             if owner not in by_name:
                 raise ValueError(f"state {key!r} belongs to no strategy of this run ({', '.join(by_name) or 'none'}).")
             s = by_name[owner]
-            (s.state if mark == "." else s.run_state)[name] = rows.to(s.device, copy=True)
+            known = in_our_shapes({name: rows})[name]  # earlier versions stored the host's
+            (s.state if mark == "." else s.run_state)[name] = known.to(s.device, copy=True)
 
 
 def _only(strategies: Sequence[Strategy], hook: str) -> Strategy:

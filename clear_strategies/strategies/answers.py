@@ -14,7 +14,7 @@ from torch import Tensor
 
 from clear_strategies.core import deferred
 from clear_strategies.core.finite import is_finite, rows_not_finite
-from clear_strategies.core.gradients import Grads
+from clear_strategies.core.gradients import Grads, in_our_shapes
 from clear_strategies.errors import AnswerError
 from clear_strategies.strategies.base import Strategy
 
@@ -89,10 +89,11 @@ def rows_like(
     for name, x in answer.items():
         if name not in like:
             refuse(s, hook, f"attributes {whose}, {', '.join(like)}", name)
-        shape, at = like[name].shape, like[name].device
+        shape, at = in_our_shapes(like)[name].shape, like[name].device
         if not (fits := is_real(x, shape)) or x.device != at:
             refuse(s, hook, f"{name} as a tensor {[*shape]}" + f" on {at}, not on {x.device}" * fits, x)
-    g = Grads({name: x.double() if like[name].dtype == torch.float64 else x.float() for name, x in answer.items()})
+    typed = {k: x.double() if like[k].dtype == torch.float64 else x.float() for k, x in answer.items()}
+    g = Grads({k: x.view_as(like[k]) for k, x in typed.items()})
     if finite:
         require_finite(s, hook, g)
     return g

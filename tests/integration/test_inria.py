@@ -6,7 +6,7 @@ import math
 import pickle
 import runpy
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import pytest
@@ -14,11 +14,11 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
-from clear_strategies import GCO, P2G, SVS, Conductor, DataError, Objective, RandomBackground, SplatSuRe
+from clear_strategies import GCO, P2G, SVS, Conductor, DataError, Objective, RandomBackground, SplatSuRe, Strategy
 from clear_strategies.data.priors import Images
 from clear_strategies.errors import SettingError
 from clear_strategies.geometry import projection
-from clear_strategies.schedules import Ramp, scaled
+from clear_strategies.schedules import Ramp, WarmupDecay, scaled
 from clear_strategies.strategies import random_background
 from clear_strategies.training.loop import iterate, view_at
 from integration import HostError
@@ -114,6 +114,32 @@ def test_its_steps_equal_those_of_our_own_trainer(inria_host, inria_capture, mon
         assert difference < 1e-9, name
     assert clear.attachment.counts["merges"] == STEPS
     assert clear.attachment.counts["HR renders"] == STEPS - 1  # lambda_HR is 0 until t = 1
+
+
+@dataclass(frozen=True)
+class ReadsOpacities(Strategy):
+    """Its hooks take one opacity a row, and raise the gradient of all by 0.5."""
+
+    def correct(self, lr, hr, step):
+        assert {x["opacities"].shape for x in (lr, hr, step.params)} == {step.visible.shape}
+        return {"opacities": torch.zeros_like(hr["opacities"])}
+
+    def regularize(self, params, t):
+        return {"opacities": torch.full_like(self.splats(params).opacities, 0.5)}
+
+    def after_step(self, params, step):
+        params["opacities"].copy_(step.visible * 7.0)
+
+
+def test_strategies_are_shown_opacities_in_the_shape_of_all_other_trainers(inria_host, inria_capture):
+    _, _, plain = trained(inria_host, inria_capture, [], objective=WITHOUT_HR, iterations=1)
+    objective = replace(HR_FROM_START, lambda_hr=WarmupDecay(start=0, full=0, decay_from=100, end=100))
+    gaussians, _, grads = trained(inria_host, inria_capture, [ReadsOpacities()], objective=objective, iterations=1)
+    assert torch.allclose(grads["opacities"], plain["opacities"] + 0.5, atol=1e-6)
+    assert gaussians._opacity.shape == (N, 1)
+    assert gaussians._opacity.unique().tolist() in ([7], [0, 7])
+    (conductor := Conductor(svs())).load_state_dict({"SVS.opacities": torch.ones(N, 1)})  # of an earlier version
+    assert conductor.state_dict()["SVS.opacities"].shape == (N,)
 
 
 @pytest.mark.parametrize("step_first", [False, True], ids=["densify, step", "step, densify"])
