@@ -44,10 +44,11 @@ def require_stored(s: Strategy, params: Mapping[str, Tensor]) -> None:
                     "x.detach().requires_grad_()."
                 )
             address = x.data_ptr()  # 0: the tensor has no memory
-            if address and (address in taken or any(address in memory for memory in of_parameters)):
+            shares = any(size > 1 and step == 0 for size, step in zip(x.shape, x.stride(), strict=True))
+            if address and (shares or address in taken or any(address in memory for memory in of_parameters)):
                 raise AnswerError(
-                    f"{entry} must be a tensor of its own, got the memory of a parameter or of another tensor that is stored, "
-                    "which changes with it. Store its clone()."
+                    f"{entry} must be a tensor of its own, got the memory of a parameter, of another tensor that is stored, or "
+                    "of other rows (expand), which changes with it. Store its clone()."
                 )
             taken.add(address)
 

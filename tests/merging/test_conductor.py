@@ -566,6 +566,7 @@ def field_and_view(dtype=torch.float64, degree=1):
         value.add_(torch.randn(value.shape, generator=g), alpha=0.05)
     field.degree = degree
     field.update_filter([v.hr.camera for v in scene.train], 0.2)
+        ("state", lambda p: {"x": torch.ones(1).expand(len(p))}, "'x'.* a tensor of its own, .* or of other rows"),
     view = scene.train[1]
     lr, hr = (Photo(photo.camera, photo.image.to(dtype)) for photo in (view.lr, view.hr))
     return field.to(dtype), replace(view, lr=lr, hr=hr)
