@@ -34,7 +34,6 @@ from clear_strategies.strategies.answers import (
     rows_like,
 )
 from clear_strategies.strategies.base import (
-    ALL_ANSWER,
     ONE_ANSWER,
     RunFacts,
     Scale,
@@ -42,8 +41,8 @@ from clear_strategies.strategies.base import (
     begin,
     by_class,
     by_exp_and_sigmoid,
-    misspelled,
     overrides,
+    unused,
 )
 from rasterizers.guards import iteration
 from rasterizers.interface import Camera, Color, Splats
@@ -95,10 +94,8 @@ class Hooks:
         self._pulled_at: int | None = None  # the last iteration in which `regularized` found a gradient
         self._answering = {hook: _only(strategies, hook) for hook in ONE_ANSWER}
         for s in strategies:
-            if not any(overrides(s, hook) for hook in (*ONE_ANSWER, "correct", *ALL_ANSWER)):
-                _log.warning("%s implements no hook; it has no effect.", type(s).__name__)
-            for hook, name in misspelled(type(s)).items():
-                _log.warning("%s.%s() is no hook: nothing calls it. There is %s().", type(s).__name__, name, hook)
+            for sentence in unused(type(s)):
+                _log.warning("%s", sentence)
 
     def owner(self, hook: str) -> Strategy | None:
         """The strategy that answers a hook which only one may answer; None: no strategy does."""
@@ -244,10 +241,10 @@ class Hooks:
         Raises:
             AnswerError: the answer is not valid.
         """
-            answer = s.correct(in_our_shapes(g_lr), in_our_shapes(g_hr), step)
         s = self._answering["reconcile"]
         if overrides(s, "correct"):
             g_lr, g_hr = both()
+            answer = s.correct(in_our_shapes(g_lr), in_our_shapes(g_hr), step)
             # By attributes of g_HR; those that the answer leaves out are 0.
             return rows_like(s, "correct", answer, g_hr, "of g_HR", finite=finite)
         weights, (n, groups), at = s.reconcile(products, step), products.dot.shape, products.dot.device
@@ -303,10 +300,10 @@ class Hooks:
         with self.work_log.stage("pictures of extra views"):  # a pseudo view is made when it is first asked for
             return [extra for s in self.showing for extra in _extra_views(s, t)]
 
-        params = in_our_shapes(params)
     @apart_from_the_loop
     def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
         """After the optimizer steps of an iteration."""
+        params = in_our_shapes(params)
         for s in self.strategies:
             asked = dict(params) if overrides(s, "after_step") else {}
             before = {name: _memory(p) for name, p in asked.items()}

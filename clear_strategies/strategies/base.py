@@ -257,7 +257,7 @@ class Strategy:
             lambda_hr: the largest λ_HR(t) of the run.
             lambda_hf: the share of the high-frequency loss in it.
         """
-        own = {hook for hook in (*ONE_ANSWER, "correct", *ALL_ANSWER) if overrides(self, hook)}
+        own = hooks_of(type(self))
         if own and lambda_hr == 0 and own <= {"route", "reconcile", "correct"}:
             return "lambda_HR is 0 throughout"
         if lambda_hf == 0 and own == {"route"}:
@@ -336,6 +336,11 @@ def overrides(strategy: Strategy, hook: str) -> bool:
     return getattr(type(strategy), hook) is not getattr(Strategy, hook)
 
 
+def hooks_of(cls: type[Strategy]) -> set[str]:
+    """The hooks that a class answers."""
+    return {hook for hook in (*ONE_ANSWER, "correct", *ALL_ANSWER) if getattr(cls, hook) is not getattr(Strategy, hook)}
+
+
 def begin(s: Strategy, run: RunFacts, n_views: int) -> None:
     """Make a strategy forget its last run and start this one, whose facts other strategies share."""
     s._forget(run)
@@ -344,14 +349,19 @@ def begin(s: Strategy, run: RunFacts, n_views: int) -> None:
     s.to(run.device)
 
 
-def misspelled(cls: type[Strategy]) -> dict[str, str]:
-    """Public methods that `Strategy` does not have, by the hook which each resembles and which the class does not override."""
-    found = dict[str, str]()
+def unused(cls: type[Strategy]) -> list[str]:
+    """What nothing calls, in sentences: methods named nearly as a hook that the class lacks, and weights beside `correct`."""
     inherited = (name for name in vars(Strategy) if getattr(cls, name) is getattr(Strategy, name))
     hooks = [name for name in inherited if name not in _OWN_NAMES | {"log", "to"} and name[0] != "_"]
+    own = cls.__name__
+    found = [] if hooks_of(cls) else [f"{own} implements no hook; it has no effect."]
     for name, _ in inspect.getmembers(cls, inspect.isfunction):
         if name[0] != "_" and not hasattr(Strategy, name):
-            found |= dict.fromkeys(get_close_matches(name, hooks, n=1, cutoff=_ALIKE), name)
+            near = get_close_matches(name, hooks, n=1, cutoff=_ALIKE)
+            found += [f"{own}.{name}() is no hook: nothing calls it. There is {hook}()." for hook in near]
+    both, code = {"correct", "reconcile"}, getattr(inspect.unwrap(cls.correct), "__code__", None)
+    if both <= vars(cls).keys() and code and both.isdisjoint(code.co_names):  # nor by super().correct()
+        found.append(f"{own}.correct() is called in place of {own}.reconcile(): keep one of them.")
     return found
 
 

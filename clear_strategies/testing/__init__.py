@@ -22,7 +22,7 @@ from clear_strategies.errors import AnswerError, DivergedError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.logs import computed
 from clear_strategies.schedules import scaled
-from clear_strategies.strategies.base import Strategy
+from clear_strategies.strategies.base import Strategy, unused
 from clear_strategies.testing import given
 from clear_strategies.testing.densifier import check_densifier_takes_everything_along
 from clear_strategies.testing.given import Make, StubShot, without_error
@@ -205,6 +205,11 @@ def check_can_be_copied(make: Make) -> None:
     require(ForkingPickler.loads(sent) == conductor.strategies[0], "a strategy does not survive pickling")
 
 
+def check_all_of_it_is_called(make: Make) -> None:
+    """It has a hook, none of a misspelled name, and not `reconcile` beside a `correct` that takes its place."""
+    require(not (never := unused(type(make()))), " ".join(never))
+
+
 CHECKS: Final[Sequence[Callable[[Make], None]]] = (
     check_is_frozen_settings,
     check_what_is_shown_is_left_alone,
@@ -217,4 +222,5 @@ CHECKS: Final[Sequence[Callable[[Make], None]]] = (
     check_densifier_takes_everything_along,
     check_facts_can_be_asked,
     check_can_be_copied,
+    check_all_of_it_is_called,
 )

@@ -34,7 +34,7 @@ from clear_strategies.errors import AnswerError, SettingError
 from clear_strategies.kernels.losses import reference
 from clear_strategies.merging.logs import computed
 from clear_strategies.schedules import WarmupDecay
-from clear_strategies.strategies.base import misspelled
+from clear_strategies.strategies.base import unused
 from clear_strategies.testing import CHECKS, ContractError, check_strategy, given
 from clear_strategies.training import loop
 from clear_strategies.training.densifier import Densifier
@@ -352,9 +352,38 @@ def test_a_strategy_without_a_hook_is_told_and_a_method_whose_name_is_nearly_tha
         "Misspells.on_resized() is no hook: nothing calls it. There is on_resize().",
         "Misspells.regularise() is no hook: nothing calls it. There is regularize().",
     ]
+    with pytest.raises(ContractError, match=r"Misspells.regularise\(\) is no hook"):
+        check_strategy(Misspells)
     ours = [cls for cls in Strategy.__subclasses__() if cls.__module__.startswith("clear_strategies.")]
     assert {cls.__name__ for cls in ours} >= {"GCO", "P2G", "SVS", "PseudoViews", "MCMC"}
-    assert not [cls for cls in ours if misspelled(cls)]
+    assert not [cls for cls in ours if unused(cls)]
+
+
+@dataclass(frozen=True)
+class DecidesTwice(Strategy):
+    def reconcile(self, products, step):
+        return Weights(keep=0.5)
+
+    def correct(self, lr, hr, step=None):
+        return hr
+
+
+@dataclass(frozen=True)
+class DecidesByWeights(DecidesTwice):
+    def reconcile(self, products, step):
+        return Weights(keep=0.5)
+
+    def correct(self, lr, hr, step=None):
+        return super().correct(lr, hr, step)
+
+
+def test_weights_that_a_correct_of_the_same_class_leaves_unused_are_told(caplog):
+    Conductor(DecidesByWeights())
+    assert not caplog.records
+    Conductor(DecidesTwice())
+    assert caplog.messages == [
+        "DecidesTwice.correct() is called in place of DecidesTwice.reconcile(): keep one of them."
+    ]
 
 
 def test_a_strategy_takes_part_in_one_run_at_a_time_and_a_copy_in_none():
@@ -537,6 +566,7 @@ def test_the_contract_of_a_densifier(fault, message):
         ("state", lambda p: {"x": p}, "'x'.* a tensor of its own, got the memory of a parameter"),
         ("state", lambda p: {"x": p[:, 2]}, "'x'.* a tensor of its own, got the memory of a parameter"),
         ("run_state", lambda p: {"x": p[:2]}, "'x'.* a tensor of its own, got the memory of a parameter"),
+        ("state", lambda p: {"x": torch.ones(1).expand(len(p))}, "'x'.* a tensor of its own, .* or of other rows"),
         ("run_state", lambda p: dict.fromkeys("xy", torch.zeros(2)), "'y'.* a tensor of its own, .*of another tensor"),
         ("run_state", lambda p: {3: torch.zeros(2)}, "3.* must have a text as its key, which is what checkpoints keep"),
         ("run_state", lambda p: {"x": 0.5}, "'x'.* must be a tensor that requires no gradient, got 0.5"),
@@ -566,7 +596,6 @@ def field_and_view(dtype=torch.float64, degree=1):
         value.add_(torch.randn(value.shape, generator=g), alpha=0.05)
     field.degree = degree
     field.update_filter([v.hr.camera for v in scene.train], 0.2)
-        ("state", lambda p: {"x": torch.ones(1).expand(len(p))}, "'x'.* a tensor of its own, .* or of other rows"),
     view = scene.train[1]
     lr, hr = (Photo(photo.camera, photo.image.to(dtype)) for photo in (view.lr, view.hr))
     return field.to(dtype), replace(view, lr=lr, hr=hr)
