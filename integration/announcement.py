@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from clear_strategies.core.view import View
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.strategies.base import overrides
+from clear_strategies.strategies.base import hooks_of, overrides
 from integration.host import Host
 
 _log = logging.getLogger(__name__)
@@ -58,7 +58,8 @@ def announce(conductor: Conductor, views: Sequence[View], host: Host) -> None:
         **({"background": "chooses its background itself"} if host.own_background else {}),
     }.items():
         for owner in (s for s in conductor.strategies if overrides(s, hook)):
-            _log.warning("%s has no effect here: the host %s.", type(owner).__name__, reason)
+            part = f".{hook}()" * bool(hooks_of(type(owner)) - {hook, "draw", "extra_views"})
+            _log.warning("%s%s has no effect here: the host %s.", type(owner).__name__, part, reason)
     for s in conductor.comparing:
         _log.warning("%s.compare() is called at HR alone: the host has the loss at LR.", type(s).__name__)
     if not conductor.strategies:

@@ -571,6 +571,12 @@ def test_a_strategy_without_effect_is_told(objective, warned, caplog):
     assert ("GCO has no effect: lambda_HR is 0 throughout." in caplog.text) == warned
 
 
+def test_of_a_strategy_that_a_host_calls_in_part_the_other_part_is_told(caplog):
+    hooks = {"densifier": lambda self, field, views, seed: None, "score": lambda self, step, screen: None}
+    started(type("Grows", (Strategy,), hooks)())
+    assert "Grows.densifier() has no effect here: the host keeps its own density control." in caplog.text
+
+
 @pytest.mark.parametrize("own_background", [False, True])
 def test_all_renders_are_over_the_background_of_a_strategy_unless_the_loop_has_its_own(own_background, caplog) -> None:
     caplog.set_level("INFO")
