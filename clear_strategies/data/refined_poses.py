@@ -61,7 +61,6 @@ def refined(capture: Capture, cache: Path | None = None, settings: SfmSettings |
         folder = cache / _cache_key(frames, work / features.COPIES, settings)
         if not (folder / sfm.MODEL).is_file():
             _log.info("%s: refining the poses of %d photos.", capture.name, len(frames))
-            features.require_room(work, len(frames), settings)
             if (model := _adjusted(pycolmap, work, capture, groups, settings)) is None:
                 _log.warning("data.refine_poses has no effect: no two photos share %d points.", _FEWEST_POINTS)
                 return capture
@@ -116,9 +115,7 @@ def _cache_key(frames: Sequence[Frame], copies: Path, settings: SfmSettings) -> 
 
 def _adjusted(pycolmap: Any, work: Path, capture: Capture, groups: Groups, settings: SfmSettings) -> Any:
     """The adjusted model, in which photos that are not adjusted are not registered; None if fewer than two are."""
-    database = work / features.DATABASE
-    features.extract(pycolmap, database, groups, settings, Path(capture.name))
-    features.match(pycolmap, database, [name for names in groups.values() for name in names], settings.threads)
+    database = features.find_and_match(pycolmap, work, groups, settings, Path(capture.name))
     frame_of = {copy_name(i): frame for i, frame in enumerate(capture.frames)}
     with pycolmap.Database.open(database) as opened:
         model = pycolmap.Reconstruction()

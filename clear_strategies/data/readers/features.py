@@ -106,10 +106,19 @@ def workspace(root: Path, cache: Path, prefix: str, settings: SfmSettings) -> It
         pycolmap.logging.minloglevel = level
 
 
-def require_room(work: Path, count: int, settings: SfmSettings) -> None:
-    """Raise an OSError if the disk is too full for the features of `count` photos: COLMAP would end the process."""
-    if shutil.disk_usage(work).free < count * settings.max_features * _PER_FEATURE + _PER_DATABASE:
+def find_and_match(pycolmap: Any, work: Path, groups: Groups, settings: SfmSettings, root: Path) -> Path:
+    """Find features in the copies, and match and verify all pairs of copies; returns the database.
+
+    Raises:
+        OSError: the disk is too full for the features: COLMAP would end the process.
+    """
+    names = [name for names in groups.values() for name in names]
+    if shutil.disk_usage(work).free < len(names) * settings.max_features * _PER_FEATURE + _PER_DATABASE:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(work.parent))
+    database = work / DATABASE
+    _extract(pycolmap, database, groups, settings, root)
+    _match(pycolmap, database, names, settings.threads)
+    return database
 
 
 def _sweep(cache: Path) -> None:
@@ -129,7 +138,7 @@ def copy_name(index: int) -> str:
     return f"{index:05d}.jpg"
 
 
-def extract(pycolmap: Any, database: Path, groups: Groups, settings: SfmSettings, root: Path) -> None:
+def _extract(pycolmap: Any, database: Path, groups: Groups, settings: SfmSettings, root: Path) -> None:
     """Find features and keep the coarsest; in enlarged copies, too, where photos are small or have few. Warns of few."""
     find = functools.partial(find_features, pycolmap, database, groups, settings)
     if min(camera.width * camera.height for camera in groups) <= _LARGE:
@@ -176,7 +185,7 @@ def find_features(pycolmap: Any, database: Path, groups: Groups, settings: SfmSe
         return int(statistics.median(opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()))
 
 
-def match(pycolmap: Any, database: Path, copies: Sequence[str], threads: int) -> None:
+def _match(pycolmap: Any, database: Path, copies: Sequence[str], threads: int) -> None:
     """Match and verify all pairs of copies, block by block."""
     options, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
     options.num_threads, options.use_gpu = threads, False

@@ -85,11 +85,8 @@ def _models(pycolmap: Any, photos: Mapping[Path, Header], work: Path, settings: 
     """Run COLMAP's incremental pipeline: extract features, match all pairs, and map; returns the models. If photos are left over,
     those mapped without EXIF's focal lengths are returned where they place more photos.
     """
-    database, root = work / features.DATABASE, next(iter(photos)).parent
-    groups = _write_copies(photos, work / features.COPIES, settings.max_side)
-    features.require_room(work, len(photos), settings)
-    features.extract(pycolmap, database, groups, settings, root)
-    features.match(pycolmap, database, [name for names in groups.values() for name in names], settings.threads)
+    groups, root = _write_copies(photos, work / features.COPIES, settings.max_side), next(iter(photos)).parent
+    database = features.find_and_match(pycolmap, work, groups, settings, root)
     _require_parallax(pycolmap, database, root)
     models, count = _mapped(pycolmap, work, len(photos), settings), len(photos)
     lengths = sorted({said.focal_35mm for said in photos.values() if said.focal_35mm is not None})
