@@ -10,15 +10,12 @@ import hashlib
 import logging
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from clear_strategies import files
 from clear_strategies.data.capture import Capture, Frame
@@ -29,6 +26,9 @@ from clear_strategies.data.readers.colmap_model import read_model
 from clear_strategies.data.readers.features import CopyCamera, Groups, SfmSettings, copy_name
 from clear_strategies.geometry.cameras import centers_of
 from rasterizers.interface import Camera
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 _log = logging.getLogger(__name__)
 
@@ -158,13 +158,9 @@ def _align(pycolmap: Any, model: Any, frame_of: dict[str, Frame]) -> None:
     """Transform the model by the similarity that brings its axes and camera centres closest to the given ones."""
     images = [image for image in model.images.values() if image.has_pose]
     given = [frame_of[image.name].camera for image in images]
-    rotation = sum(
-        camera.world_to_camera[:3, :3].double().numpy().T @ image.cam_from_world().rotation.matrix()
-        for camera, image in zip(given, images, strict=True)
-    )
-    left, _, right = np.linalg.svd(rotation)
-    R = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-    there = centers_of(given).double().numpy()
+    adjusted = _rotations(image.cam_from_world().matrix() for image in images)
+    R = (_rotations(camera.world_to_camera for camera in given).inv() * adjusted).mean().as_matrix()
+    there = centers_of(given).numpy()
     here = np.array([image.projection_center() for image in images]) @ R.T
     apart, away = there - there.mean(0), here - here.mean(0)
     scale = float((apart * away).sum() / max((away * away).sum(), np.finfo(float).tiny))
@@ -175,7 +171,7 @@ def _with_model(capture: Capture, folder: Path) -> Capture:
     """The capture with the poses, focal lengths and points of the adjusted model."""
     model = read_model(folder)
     adjusted = {image.name: image for image in model.images}
-    frames, turns = [], []
+    frames, turned = [], []
     for i, frame in enumerate(capture.frames):
         if (image := adjusted.get(copy_name(i))) is None:
             frames.append(replace(frame, sfm_id=None))
@@ -186,11 +182,13 @@ def _with_model(capture: Capture, folder: Path) -> Capture:
             given, world_to_camera=image.pose, fx=x * lens.fx, fy=y * lens.fy, cx=x * lens.cx, cy=y * lens.cy
         )
         frames.append(_seen_by(frame, camera, image.id))
-        turns.append(_angle(given.world_to_camera, image.pose))
+        turned.append((given.world_to_camera, image.pose))
     if kept := [frame.name for i, frame in enumerate(capture.frames) if copy_name(i) not in adjusted]:
         message = "data.refine_poses: %d of %d photos share too little with the others, and keep their poses: %s."
         _log.warning(message, len(kept), len(frames), some(kept))
-    told = f"{len(adjusted)} of {len(frames)} refined by pycolmap, by {np.median(turns):.2f} degrees (median)"
+    before, after = map(_rotations, zip(*turned, strict=True))
+    angles = np.degrees((before * after.inv()).magnitude())
+    told = f"{len(adjusted)} of {len(frames)} refined by pycolmap, by {np.median(angles):.2f} degrees (median)"
     points = replace(model.points, source=f"{len(model.points.means):,} points, triangulated from refined poses")
     notes = {**capture.notes, "poses": f"{capture.notes.get('poses', 'given')}; {told}"}
     return replace(capture, frames=tuple(frames), points=points, notes=notes)
@@ -201,7 +199,8 @@ def _seen_by(frame: Frame, camera: Camera, sfm_id: int) -> Frame:
     return replace(frame, camera=camera, sfm_id=sfm_id, load=lambda: replace(frame.load(), camera=camera))
 
 
-def _angle(a: Float[Tensor, "4 4"], b: Float[Tensor, "4 4"]) -> float:
-    """The angle between two rotations, degrees."""
-    cosine = ((a[:3, :3].double() @ b[:3, :3].double().T).trace() - 1) / 2
-    return float(torch.rad2deg(torch.arccos(cosine.clamp(-1, 1))))
+def _rotations(poses: Iterable[Any]) -> Rotation:
+    """The rotations of these poses, [3 or 4, 4]."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix([np.asarray(pose, np.float64)[:3, :3] for pose in poses])
