@@ -19,6 +19,7 @@ from clear_strategies.bench.results import Results
 from clear_strategies.outputs.results import export_ply
 from tests.helpers import command_line, toy
 from tests.helpers.backends import why_not
+from tests.stress.bad_inputs import plys
 
 
 @pytest.fixture(scope="module")
@@ -146,6 +147,9 @@ def test_an_exported_field_is_drawn_as_the_field_draws_itself(tmp_path):
     found = rasterizer(workload.splats, workload.camera)
     torch.testing.assert_close(found.image, field.render(rasterizer, workload.camera), atol=1e-4, rtol=0)
     assert float(found.visible.float().mean()) > 0.7
+    (tmp_path / "none.ply").write_bytes(plys.ply(count=0, body=b""))
+    with pytest.raises(DataError, match="has no Gaussians"):
+        scenes.load(str(tmp_path / "none.ply"))
 
 
 # ---- the benchmark's command line: its files, its exit codes, and the data files of docs/explanation/benchmarks.md
