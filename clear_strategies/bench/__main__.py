@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from typing import Any, Final
 
@@ -46,7 +47,7 @@ QUESTIONS: Final[Mapping[str, tuple[str, Options]]] = {
     "host": ("what the strategies cost in another trainer's loop", {
         "--strategies": {"nargs": "+", "default": ["gco", "p2g", "svs", "clear", "clear skips=none", "best"],
                          "metavar": "NAME", "help": "as in `conductor`, with overrides after a space"},
-        "--gaussians": {"type": positive, "default": 46_000, "metavar": "N", "help": "default 46000"},
+        "--gaussians": {"type": partial(positive, most=10**9), "default": 46_000, "metavar": "N", "help": "default 46000"},
         "--width": {"type": positive, "default": 128, "metavar": "PX", "help": "of the LR photos (default 128)"},
         **_TURNS, "--repeats": {**_TURNS["--repeats"], "default": 20},
     }),

@@ -46,8 +46,8 @@ def path_of(text: str) -> Path:
     return Path(expanded(text))
 
 
-def positive(text: str) -> int:
-    """The argparse type of a whole number above 0."""
-    if not (text.isdecimal() and int(text) > 0):
-        raise argparse.ArgumentTypeError(f"must be a whole number above 0, got {text}")
+def positive(text: str, most: int = 100_000) -> int:
+    """The argparse type of a whole number above 0: of pixels, pictures or threads, which no machine has more of."""
+    if not (text.isdecimal() and len(text) < 20 and 0 < int(text) <= most):
+        raise argparse.ArgumentTypeError(f"must be a whole number above 0 and at most {most:,}, got {text[:20]}")
     return int(text)
