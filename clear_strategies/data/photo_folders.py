@@ -74,7 +74,7 @@ def list_images(folder: Path) -> list[Path]:
     names what the folder contains instead.
     """
     if not folder.is_dir():
-        raise DataError(folder, "folder", "is not there", "check the path")
+        raise DataError(folder, "folder", "is a file" if folder.exists() else "is not there", "check the path")
     if images := images_in(folder):
         return images
     problem, remedy = f"holds no image ({', '.join(SUFFIXES)})", "check the path"

@@ -46,6 +46,7 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no folder of photos": (image_folder, "images: has none of the folders images, images_2"),
     "folder of photos by a name that is not there": (lambda folder: image_folder(folder, "images_16"), "is no folder"),
     "photos at a path that is absent": (at("none", list_images), "folder: is not there"),
+    "photos at a path that is a file": (at("file", list_images, b"no folder"), "folder: is a file"),
     "folder without images": (at("", list_images, _hidden_photos_only), "images: holds no image"),
     "lock held by this process": (_held_twice, "is at work in this folder"),
     "run that is absent": (at("none", open_splat), "none"),
