@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -40,10 +40,14 @@ class Onnx:
     path: str = ""
     tile: int = 192
     overlap: int = 16
+    version: str = field(init=False)  # of OpenCV; part of the cache's key, since another version may round differently
 
     def __post_init__(self) -> None:
         require_path(self.path, "a network in ONNX")
         require_tiles(self.tile, self.overlap)
+        import cv2
+
+        object.__setattr__(self, "version", cv2.__version__)
 
     @property
     def label(self) -> str:

@@ -5,6 +5,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -156,6 +157,16 @@ def test_what_changes_the_result_changes_the_key_and_nothing_else_does(model: Pa
     assert worked(Counting(str(model)), folder, lr.reshape(6, 5, 3))
     model.write_bytes(b"other weights")
     assert worked(Counting(str(model)), folder, lr)
+
+
+def test_another_version_of_opencv_computes_the_images_of_a_network_in_onnx_again(network, tmp_path, monkeypatch):
+    def entries() -> int:
+        Cached(Onnx(str(network)), tmp_path / "cache")("view", photo(4, 4), 4)
+        return len(list((tmp_path / "cache").iterdir()))
+
+    assert [entries(), entries()] == [1, 1]
+    monkeypatch.setattr(cv2, "__version__", "another")
+    assert entries() == 2
 
 
 @pytest.mark.parametrize("damage", ["truncated", "garbage", "another size"])
