@@ -19,10 +19,12 @@ from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.data.view_names import file_stems
 from clear_strategies.errors import DataError, SettingError, counted
+from clear_strategies.files import FINISHED
 from clear_strategies.jobs import device
 from clear_strategies.jobs.device import ReadyRasterizer
 from clear_strategies.jobs.resume import folder_of
 from clear_strategies.options import options
+from clear_strategies.outputs import metrics
 from clear_strategies.settings import TARGET, build, with_defaults
 from clear_strategies.training import checkpoint
 from clear_strategies.training.checkpoint import CHECKPOINTS
@@ -92,12 +94,7 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
     if not is_ply and checkpoint.saved(folder / CHECKPOINTS):
         saved = checkpoint.load(path)
         field, source, name = _field_of(saved, path), f"{folder}, {counted(saved.t - 1, 'iteration')}", folder.name
-        settings = {
-            key.removeprefix(_OF_RASTERIZER): value
-            for key, value in saved.config.items()
-            if key.startswith(_OF_RASTERIZER)
-            and value is not None  # the default, also of a field of an earlier version
-        }
+        settings = _of_rasterizer(saved.config)
     else:
         ply = path if is_ply else _ply_in(folder, path)
         gaussians = read_gaussians(ply)
@@ -107,7 +104,9 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
         field = GaussianField(raw | {"detail": torch.zeros_like(gaussians.means)})
         field.degree = field.max_degree
         field.constrain()  # else scales of e⁵⁰ overflow
-        settings = {} if gaussians.antialiased else {"kernel": 0.3, "antialiased": False}
+        settings = _of_finished_run(ply.parent)
+        if settings.get("antialiased", True) != gaussians.antialiased:  # of another program
+            settings = {} if gaussians.antialiased else {"kernel": 0.3, "antialiased": False}
         folder, above, source = ply.parent, _ABOVE, str(ply)
         name = folder.name if ply.name == PLY else ply.stem
     cameras = _cameras_near(folder, above)
@@ -142,6 +141,23 @@ def _field_of(saved: checkpoint.Checkpoint, path: Path) -> GaussianField:
     except (KeyError, ValueError, TypeError) as error:
         raise DataError(path, "tensors", f"hold no field ({error})", "give a run of this program") from error
     return field
+
+
+def _of_rasterizer(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of the rasterizer, without those that are None: the default, also of a field of an earlier version."""
+    of = {key.removeprefix(_OF_RASTERIZER): v for key, v in config.items() if key.startswith(_OF_RASTERIZER)}
+    return {key: value for key, value in of.items() if value is not None}
+
+
+def _of_finished_run(folder: Path) -> dict[str, Any]:
+    """The settings of the rasterizer of the run that finished in this folder; empty if there is none."""
+    if not (folder / FINISHED).is_file():
+        return {}
+    try:
+        return _of_rasterizer(metrics.read(folder / FINISHED, "train the run again").config)
+    except DataError as error:
+        _log.warning("%s. Its PLY file is drawn with default settings.", error)
+        return {}
 
 
 def _ply_in(folder: Path, path: Path) -> Path:

@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from clear_strategies.data.photo_files import read_header, read_image
 from clear_strategies.data.ply import read_gaussians, write_gaussians
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import open_splat
+from clear_strategies.outputs import metrics
 from clear_strategies.outputs.results import export_ply
 from clear_strategies.training import checkpoint
 from tests.helpers import toy
@@ -61,6 +63,22 @@ def test_a_ply_file_of_3dgs_and_of_a_run_without_compensation_is_drawn_with_its_
         assert b"SplatRenderMode" not in path.read_bytes()[:300]
         found = open_splat(path, "torch").painter.color(CAMERA)
         torch.testing.assert_close(found, field.render(rasterizer, CAMERA).clamp(0, 1), atol=2e-5, rtol=0)
+
+
+def test_the_ply_file_of_a_finished_run_is_drawn_with_the_settings_of_the_run(saved_run, tmp_path, monkeypatch, caplog):
+    rules = {"kernel": 0.05, "antialiased": False, "background": (0.0, 0.5, 1.0)}
+    exact = saved_run[1].render(rasterizers.load("torch", **rules), CAMERA).clamp(0, 1)
+    export_ply(tmp_path / "point_cloud.ply", saved_run[1], antialiased=False)
+    shutil.copy(saved_run[0] / "cameras.json", tmp_path)
+    (tmp_path / "metrics.json").write_text("{}")
+    assert not open_splat(tmp_path).antialiased
+    assert "metrics.json: " in caplog.text  # damaged, it keeps nobody from looking
+    config = {f"rasterizer.{name}": value for name, value in {"name": "torch", **rules}.items()}
+    monkeypatch.setattr(metrics, "read", lambda path, remedy: SimpleNamespace(config=config))
+    for path in (tmp_path, tmp_path / "point_cloud.ply"):
+        torch.testing.assert_close(open_splat(path).painter.color(CAMERA), exact, atol=2e-5, rtol=0)
+    export_ply(tmp_path / "point_cloud.ply", saved_run[1])  # another file, which was trained otherwise
+    assert open_splat(tmp_path).antialiased
 
 
 def test_ply_files_in_one_folder_have_their_own_names_and_are_never_overwritten(saved_run, tmp_path):
@@ -179,6 +197,7 @@ def test_another_program_reads_what_is_written(saved_run, tmp_path):
         (render, ["--path", "nowhere"], "--path: must be cameras, train, test or a file"),
         (render, ["--frames", "0"], "must be a whole number above 0"),
         (render, ["--width", "0"], "must be a whole number above 0"),
+        (render, ["--width", "9" * 400], "must be a whole number above 0 and at most 100,000, got 9{20}\\."),
         (render, ["--typo"], "unrecognized arguments: --typo"),
         (export, ["--sh", "4"], "invalid choice"),
         (export, ["--out", "a.spz"], "must end in .ply, got a.spz. splat-transform makes"),
