@@ -20,6 +20,7 @@ from jaxtyping import Float
 from clear_strategies import files
 from clear_strategies.data import strict_json
 from clear_strategies.data.capture import rigid_inverse
+from clear_strategies.data.file_names import require_text
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.strict_json import Number, typed
 from clear_strategies.errors import DataError
@@ -85,11 +86,13 @@ def read_cameras(path: Path) -> list[SavedCamera]:
         pose = rigid_inverse(path, f"[{i}].rotation", np.array(e.rotation), np.array(e.position))
         width, height = round(e.width), round(e.height)
         cx, cy = width / 2 if e.cx is None else e.cx, height / 2 if e.cy is None else e.cy
+        name = str(i) if e.img_name is None else e.img_name
         try:
+            require_text([name])
             camera = Camera(pose, e.fx, e.fy, cx, cy, width, height)
         except ValueError as error:
             raise DataError(path, f"[{i}]", str(error), "correct the camera") from error
-        found.append(SavedCamera(str(i) if e.img_name is None else e.img_name, camera, e.split, e.background))
+        found.append(SavedCamera(name, camera, e.split, e.background))
     if not found:
         raise DataError(path, "json", "is an empty list", remedy)
     return found
@@ -120,6 +123,10 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
         axes = axes.repeat(len(centers), 0)
     order = _tour(centers)
     order = order[:: -(-len(order) // _MOST_KEYS)]
+    # Photos that were taken upside down are turned: else the path would roll to each and back.
+    down = axes[order, :, 1]
+    signs = np.cumprod([1.0, *np.where((down[1:] * down[:-1]).sum(1) < 0, -1.0, 1.0)])
+    axes[order, :, :2] *= (signs if signs.sum() >= 0 else -signs)[:, None, None]
     steps = np.linalg.norm(centers[order] - centers[np.roll(order, 1)], axis=1)  # the first is that between the ends
     if steps[0] > _FAR * steps[1:].max(initial=0):
         order += order[-2:0:-1]

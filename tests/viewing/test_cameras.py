@@ -5,6 +5,7 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import imageio_ffmpeg as ffmpeg
@@ -45,6 +46,7 @@ def test_what_a_run_writes_and_what_inria_writes_is_read(tmp_path):
 
 
 TURNED = [{"width": 4, "height": 4, "fx": 4, "fy": 4, "rotation": [[1, 0], [0, 1]], "position": [0, 0, 0]}]
+NAMED = [{**TURNED[0], "rotation": np.eye(3).tolist(), "img_name": "a\0"}]
 
 
 @pytest.mark.parametrize(
@@ -53,6 +55,7 @@ TURNED = [{"width": 4, "height": 4, "fx": 4, "fy": 4, "rotation": [[1, 0], [0, 1
         (None, "is not there"), ("", "is not valid"), ("[{", "is not valid"), ("[]", "is an empty list"),
         ("[1]", "must be"), ("[{}]", "is missing"), ("{}", "must be `array`"),
         (json.dumps(TURNED), r"\[0\]\.rotation: must be `array` of length 3"),
+        (json.dumps(NAMED), r"\[0\]: a\\x00: name: must be UTF-8 without control characters"),
     ],
 )  # fmt: skip
 def test_what_holds_no_cameras_is_refused_in_one_line(tmp_path, content, message):
@@ -111,6 +114,15 @@ def test_a_path_along_an_arc_comes_back_along_it_and_not_through_the_scene():
         assert np.linalg.norm(path - end.center.numpy(), axis=1).min() < 0.1
     steps = np.linalg.norm(np.roll(path, -1, axis=0) - path, axis=1)
     assert steps.max() < 0.6
+
+
+@pytest.mark.parametrize("upside_down", [[0], range(1, 12, 2), range(4, 12)])
+def test_a_path_past_photos_that_were_taken_upside_down_does_not_roll(upside_down):
+    turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
+    ring = [replace(c, world_to_camera=turn @ c.world_to_camera) if i in upside_down else c for i, c in enumerate(RING)]
+    down = np.stack([frame.world_to_camera[1, :3].numpy() for frame in cameras.through(ring, 60)])
+    assert np.abs(down[:, 1]).min() > 0.99
+    assert (down[:, 1] > 0).all() == (len(upside_down) < 7)  # as most photos are
 
 
 def test_many_cameras_are_thinned():
