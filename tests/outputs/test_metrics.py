@@ -285,3 +285,11 @@ def test_hidden_pixels_do_not_count(photograph: Tensor) -> None:
     assert masked.ssim == pytest.approx(alone.ssim, abs=0.01)
     assert masked.gmsd == pytest.approx(alone.gmsd, abs=0.01)
     assert four(score(image, photograph, torch.ones_like(shown))) == four(score(image, photograph))
+
+
+def test_a_mask_of_one_pixel_hardly_changes_the_scores(photograph: Tensor) -> None:
+    shown = torch.ones(photograph.shape[:2], dtype=torch.bool)
+    shown[128, 128] = False
+    image = enlarged(photograph, 4)
+    image[:5] = 0.0  # beside the border, where no window of SSIM has its centre
+    assert four(score(image, photograph, shown)) == pytest.approx(four(score(image, photograph)), abs=1e-4)
