@@ -162,5 +162,7 @@ def _gradient_at_half_size(image: np.ndarray) -> np.ndarray:
 
 
 def _at_half_size(image: np.ndarray) -> np.ndarray:
-    h, w = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
-    return np.asarray(image[:h, :w].reshape(h // 2, 2, w // 2, 2).mean(axis=(1, 3)))
+    """Means of 2 x 2 pixels. The last row and column of an odd size count twice."""
+    h, w = image.shape
+    even = np.pad(image, ((0, h % 2), (0, w % 2)), mode="edge")
+    return np.asarray(even.reshape((h + 1) // 2, 2, (w + 1) // 2, 2).mean(axis=(1, 3)))

@@ -287,6 +287,14 @@ def test_hidden_pixels_do_not_count(photograph: Tensor) -> None:
     assert four(score(image, photograph, torch.ones_like(shown))) == four(score(image, photograph))
 
 
+def test_the_last_column_of_an_odd_width_alone_has_all_scores() -> None:
+    shown = torch.zeros(14, 15, dtype=torch.bool)
+    shown[:, -1] = True
+    scores = score(noise(0, 14, 15), noise(1, 14, 15), shown)
+    assert all(map(math.isfinite, four(scores)))
+    assert scores.gmsd > 0
+
+
 def test_a_mask_of_one_pixel_hardly_changes_the_scores(photograph: Tensor) -> None:
     shown = torch.ones(photograph.shape[:2], dtype=torch.bool)
     shown[128, 128] = False
