@@ -118,8 +118,8 @@ def _measured(name: str, metric: Metric, image: Float[Tensor, "H W 3"], truth: F
 
 
 def _ssim(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None) -> float:
-    """Mean SSIM of the windows that lie inside the image about shown pixels: without a mask by the loss's kernel, in a thirtieth of
-    scikit-image's time; they differ by less than 1e-6.
+    """Mean SSIM of the windows that lie inside the image about shown pixels: without a mask by the loss's kernel, in a thirtieth
+    of scikit-image's time; they differ by less than 1e-6.
     """
     if shown is None and native.available():
         images = x.float().contiguous(), y.float().contiguous()
