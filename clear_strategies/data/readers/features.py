@@ -80,17 +80,20 @@ class SfmSettings:
 
 
 @contextlib.contextmanager
-def workspace(root: Path, cache: Path, prefix: str, settings: SfmSettings) -> Iterator[tuple[Any, Path]]:
+def workspace(
+    root: Path, cache: Path, prefix: str, settings: SfmSettings, threads: str = ""
+) -> Iterator[tuple[Any, Path]]:
     """Make a temporary folder in the cache, in which poses are estimated. Yields pycolmap and the folder.
 
     Args:
         prefix: 24 hexadecimal digits, by which the folder of a killed run is found.
+        threads: the name of the setting by which users limit the threads; empty: there is none.
 
     Raises:
         DataError: pycolmap is not installed or fails, or memory is limited to too little.
     """
     pycolmap = import_pycolmap()
-    _require_addresses(root, _threads(settings))
+    _require_addresses(root, _threads(settings), threads)
     cache.mkdir(parents=True, exist_ok=True)
     _sweep(cache)
     level = pycolmap.logging.minloglevel
@@ -239,7 +242,7 @@ def _threads(settings: SfmSettings) -> int:
     return settings.threads if settings.threads > 0 else os.cpu_count() or 1
 
 
-def _require_addresses(root: Path, threads: int) -> None:
+def _require_addresses(root: Path, threads: int, setting: str) -> None:
     """Raise a DataError if the system limits memory to less than COLMAP takes: its libraries would abort, or wait for ever."""
     try:
         if sys.platform != "win32":  # Windows has no such limit
@@ -248,7 +251,7 @@ def _require_addresses(root: Path, threads: int) -> None:
         needed = (
             f"COLMAP takes up to {(threads + 1) * _PER_WORKER >> 20} MB of addresses with {counted(threads, 'thread')}"
         )
-        remedy = "raise `ulimit -v`" + ", or set data.reader.threads=1" * (threads > 1)
+        remedy = "raise `ulimit -v`" + f", or set {setting}=1" * (threads > 1 and setting != "")
         raise DataError(root, "memory", f"{needed}, and the system leaves this process less", remedy) from error
 
 

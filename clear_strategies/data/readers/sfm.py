@@ -51,7 +51,7 @@ def reconstruct(root: Path, photos: Mapping[Path, Header], folder: Path, setting
         DataError: pycolmap is not installed, memory is limited to too little, or too few photos can be placed.
     """
     count = len(photos)
-    with features.workspace(root, folder.parent, folder.name, settings) as (pycolmap, work):
+    with features.workspace(root, folder.parent, folder.name, settings, "data.reader.threads") as (pycolmap, work):
         _log.info("%s: estimating the poses of %d photos, up to %d features each.", root, count, settings.max_features)
         models = sorted(_models(pycolmap, photos, work, settings), key=lambda m: m.num_reg_images(), reverse=True)
         require_placed(root, _most_placed(models), count)

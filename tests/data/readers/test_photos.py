@@ -179,13 +179,19 @@ def test_a_disk_that_is_too_full_for_the_features_is_told_before_colmap_ends_the
 LIMITED = """
 import os, re, resource, signal
 from pathlib import Path
+from clear_strategies.data.capture import Capture
 from clear_strategies.data.readers import features, sfm
+from clear_strategies.data.refined_poses import refined
 features.import_pycolmap()
 used = 1024 * int(re.search(r"VmSize:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
 resource.setrlimit(resource.RLIMIT_AS, (used + (600 << 20), -1))
-features._require_addresses(Path("here"), 1)
+features._require_addresses(Path("here"), 1, "")
 try:
     sfm.reconstruct(Path("here"), {}, Path("model"), sfm.SfmSettings(480, 2000, False, 2, 0))
+except sfm.DataError as error:
+    print(error, flush=True)
+try:
+    refined(Capture("given", ()), Path("cache"), features.SfmSettings(threads=2))
 except sfm.DataError as error:
     print(error, flush=True)
 os.kill(os.getpid(), signal.SIGTERM)
@@ -197,10 +203,9 @@ def test_less_memory_than_colmap_takes_is_told_and_a_signal_ends_the_process_wit
     """COLMAP's libraries would end the process without memory, or wait for ever, and print a stack trace of the signal."""
     ended = subprocess.run([sys.executable, "-c", LIMITED], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stderr) == (-signal.SIGTERM, "")
-    assert ended.stdout == (
-        "here: memory: COLMAP takes up to 768 MB of addresses with 2 threads, and the system leaves this process less: "
-        "raise `ulimit -v`, or set data.reader.threads=1\n"
-    )
+    told = "memory: COLMAP takes up to 768 MB of addresses with 2 threads, and the system leaves this process less"
+    remedy = "raise `ulimit -v`"
+    assert ended.stdout == f"here: {told}: {remedy}, or set data.reader.threads=1\ngiven: {told}: {remedy}\n"
 
 
 def database_of(
