@@ -110,6 +110,8 @@ def _mapped(pycolmap: Any, work: Path, count: int, settings: SfmSettings) -> lis
     # COLMAP's thresholds are for hundreds of photos: they place four of ten photos around a table, these place six.
     mapping.mapper.init_min_num_inliers, mapping.mapper.init_min_tri_angle = 50, 8.0
     mapping.mapper.abs_pose_min_num_inliers = 15
+    # The first two photos may lie one behind the other, as of a dolly: the angle above already demands parallax.
+    mapping.mapper.init_max_forward_motion = 1.0
     # With few photos most points are seen by two only. These points make the six poses four times more exact.
     mapping.triangulation.ignore_two_view_tracks = False
     _log.info("placing the photos.")

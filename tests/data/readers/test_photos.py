@@ -1,6 +1,7 @@
 """Photos without poses: structure from motion finds the true cameras, up to a similarity, and caches them."""
 
 import errno
+import itertools
 import logging
 import os
 import signal
@@ -225,6 +226,28 @@ def database_of(
             geometry.inlier_matches = np.zeros((matches, 2), np.uint32)
             database.write_two_view_geometry(one + 1, other + 1, geometry)  # COLMAP counts from 1
     return found
+
+
+def test_photos_along_the_optical_axis_are_placed(tmp_path: Path) -> None:
+    """Of each pair, one photo lies behind the other. The features are exact projections of points."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-3, -2, 4), (3, 2, 9), (400, 3))
+    ahead = np.array([0.0, 0.7, 1.4, 2.1])
+    (tmp_path / features.COPIES).mkdir()
+    with pycolmap.Database.open(tmp_path / features.DATABASE) as database:
+        camera = database.write_camera(pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 520.0, 640, 480))
+        for number, z in enumerate(ahead):
+            Image.new("RGB", (640, 480)).save(tmp_path / features.COPIES / sfm.copy_name(number))
+            image = database.write_image(pycolmap.Image(sfm.copy_name(number), camera_id=camera))
+            seen = 520 * points[:, :2] / (points[:, 2:] - z) + (320, 240)
+            database.write_keypoints(image, (seen + rng.normal(size=seen.shape) * 0.2).astype(np.float32))
+        for one, other in itertools.combinations(range(1, 5), 2):
+            database.write_matches(one, other, np.arange(400, dtype=np.uint32)[:, None].repeat(2, 1))
+    pycolmap.geometric_verification(tmp_path / features.DATABASE, pycolmap.GeometricVerifierOptions())
+    (model,) = sfm._mapped(pycolmap, tmp_path, 4, SfmSettings(threads=1))
+    centers = np.array([model.images[i].projection_center() for i in range(1, 5)])
+    steps = np.linalg.norm(centers - centers[0], axis=1)
+    assert steps / steps[-1] == pytest.approx(ahead / ahead[-1], abs=0.01)
 
 
 def test_a_photo_without_a_pose_is_told_with_the_placed_photo_that_it_has_most_in_common_with(tmp_path: Path) -> None:
