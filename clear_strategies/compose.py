@@ -191,12 +191,17 @@ def require_text(overrides: Iterable[object]) -> None:
 
 
 def require_each_once(overrides: Iterable[str]) -> None:
-    """Raise a SettingError for a strategy that is named twice, since Hydra merges the two into one silently, and for what is no
-    name. Warn of the strategies that a method sets aside.
+    """Raise a SettingError for a strategy that is named twice, since Hydra merges the two into one silently, for what is no name,
+    and for a claim before the strategies, whose options would replace it. Warn of the strategies that a method sets aside.
     """
-    before = list[str]()
+    before, claim = list[str](), ""
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         require_option(override)
+        if override.key_or_group == "claim":
+            claim = str(override.input_line)
+        if override.key_or_group in ("strategy", "method") and claim:
+            rule = f"{claim}: must stand behind the strategies that it changes, got it before {override.input_line}"
+            raise SettingError(f"{rule}. Write {override.input_line} {claim}.")
         if override.key_or_group == "method" and before and override.value():
             message = "%s has no effect: %s replaces the strategies before it. What is written behind the method is added to it."
             _log.warning(message, " ".join(before), override.input_line)

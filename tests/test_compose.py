@@ -229,6 +229,13 @@ def test_a_strategy_that_a_method_sets_aside_is_told(overrides, caplog):
     assert said == [] if not ASIDE[overrides] else said[0].startswith(ASIDE[overrides])
 
 
+@pytest.mark.parametrize("behind", ["+strategy=clear", "+method=srgs"])
+def test_a_claim_before_the_strategies_that_would_replace_it_is_refused(behind):
+    with pytest.raises(SettingError, match=rf"Write \{behind} \+claim=dropped\."):
+        compose_module.composed(["+claim=dropped", behind], "config")
+    assert compose_module.composed(["+strategy=clear", "+claim=dropped"], "config").strategies.gco.drop
+
+
 def test_a_tilde_is_the_users_folder_wherever_a_setting_is_a_path(monkeypatch):
     monkeypatch.setenv("HOME", "/home/me")
     paths = {"data.path": "~/photos", "prior.path": "~/sr", "fit.resume": "~/run", "data.save_lr": "~"}
