@@ -128,9 +128,7 @@ def _surface(
 
 def from_ply(path: Path) -> Workload:
     """Read exported Gaussians; a DataError if the file is no such export."""
-    g = read_gaussians(path)
-    if not len(g):
-        raise DataError(path, "element vertex", "has no Gaussians", "export it again")
+    g = read_gaussians(path, allow_empty=False)
     splats = Splats(g.means, g.quats, g.scales.exp(), g.opacities.sigmoid(), g.sh0, g.shN)
     return Workload(path.stem, splats, overview(splats.means, splats.opacities))
 

@@ -78,13 +78,18 @@ def write_gaussians(path: Path | str, g: GaussianPly) -> None:
     _write(Path(path), groups, (_MIP,) if g.antialiased else ())
 
 
-def read_gaussians(path: Path | str) -> GaussianPly:
+def read_gaussians(path: Path | str, *, allow_empty: bool = True) -> GaussianPly:
     """Read the standard layout. Other properties are ignored, with a warning that names them.
 
     Opacities of exactly 0 and 1, whose logits are infinite, are read, since formats of 8 bits have them, and so are scales of 0.
+
+    Raises:
+        DataError: the file has another layout, or no Gaussians and not `allow_empty`.
     """
     path = Path(path)
     table, comments = _read_vertices(path)
+    if not len(table) and not allow_empty:
+        raise DataError(path, "element vertex", "has no Gaussians", "export it again")
     rest = _rest_names(sum(name.startswith("f_rest_") for name in _names_of(table)))
     if len(rest) not in {3 * bands for bands in _BANDS}:
         raise DataError(path, "f_rest", f"has {len(rest)} properties where 0, 9, 24 or 45 belong", "export it again")

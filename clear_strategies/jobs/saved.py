@@ -97,9 +97,7 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
         settings = _of_rasterizer(saved.config)
     else:
         ply = path if is_ply else _ply_in(folder, path)
-        gaussians = read_gaussians(ply)
-        if not len(gaussians):
-            raise DataError(ply, "element vertex", "has no Gaussians", "export it again")
+        gaussians = read_gaussians(ply, allow_empty=False)
         raw = {name: getattr(gaussians, name) for name in PARAMETERS}
         field = GaussianField(raw | {"detail": torch.zeros_like(gaussians.means)})
         field.degree = field.max_degree
