@@ -50,7 +50,8 @@ class DensitySettings:
         every: iterations between rounds; lowered where fewer than 10 rounds would fit.
         clone_below: share of the scene's extent; smaller Gaussians are cloned, larger ones are split.
         prune_opacity: Gaussians of lower opacity are removed.
-        prune_world: Gaussians larger than this share of the extent are removed; None: never.
+        prune_world: Gaussians that are larger than this share of the extent, after cloning and splitting, are removed in every
+            round; None: never. 3DGS and gsplat begin with it after the first opacity reset.
         reset_every: iterations between opacity resets to 0.01, stretched to no less than 92, in which an opacity can return to
             1/2; 0: never. White backgrounds get one more reset at `start` (F14).
         max_gaussians: largest number of Gaussians; a warning is logged when it limits densification.
@@ -158,7 +159,8 @@ class Density(Densifier):
         split = chosen & (largest > s.clone_below * self.extent)
         keep = field.filtered_opacities() >= s.prune_opacity
         if s.prune_world is not None:
-            keep &= largest <= s.prune_world * self.extent
+            after = torch.where(split, largest / _SHRINK, largest)  # 3DGS prunes last, among the children
+            keep &= after <= s.prune_world * self.extent
         if int(keep.sum()) < min(s.min_gaussians, n):
             larger = "" if s.prune_world is None else f", or raise density.prune_world={s.prune_world}"
             raise DensityError(

@@ -30,9 +30,10 @@ SUBSETS = [s for k in range(4) for s in itertools.combinations(("gco", "p2g", "s
 
 
 def _size_that_prunes_the_two_largest() -> float:
+    """All are split in the first round, and their children are smaller by 1.6."""
     extent = cameras_extent(SCENE.train)
     sizes = GaussianField.from_cloud(SCENE.cloud).scales.data.exp()[:, 0].sort().values
-    return float(sizes[-3]) * 1.001 / extent
+    return float(sizes[-3]) * 1.001 / 1.6 / extent
 
 
 PRUNE_WORLD = _size_that_prunes_the_two_largest()

@@ -188,6 +188,14 @@ def test_an_error_names_each_setting_that_pruned_too_many(prune_world):
     assert ("raise density.prune_world=1e-06" in str(error.value)) is (prune_world is not None)
 
 
+def test_the_size_rule_removes_what_is_too_large_after_splitting():
+    field, optimizer, density = tagged(4)
+    field.scales.data[:] = torch.tensor([1.4, 1.4, 1.7, 0.9]).log()[:, None]
+    density.score[:] = density.ordinary[:] = torch.tensor([1.0, 0.0, 1.0, 0.0])  # rows 0 and 2 are split
+    density.extent, density.settings = 1.0, replace(density.settings, prune_world=1.0)
+    assert density.restructure(field, optimizer, 10).tolist() == [3, 0, 0]
+
+
 def test_a_field_of_few_gaussians_may_grow_and_not_shrink():
     field, optimizer, density = tagged()
     density.settings = replace(density.settings, min_gaussians=100, prune_opacity=0.0)
