@@ -2,7 +2,7 @@
 
 Photos of the same size and lens (by EXIF) share a camera, whose estimate starts at EXIF's focal length. If photos are left
 without a pose, all are placed again without that focal length, since programs and adapters write wrong ones, and the model with
-more photos is used.
+more photos is used. If photos that share a camera turn out to be zoomed, each gets a camera of its own.
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ _MATCHED: Final = 50  # inlier matches, from which a pair's two-view geometry is
 _NEARLY_ALL: Final = 0.9  # of the pairs
 _ROTATION: Final = 0.03  # largest entry of HᵀH - I, up to which a homography H is a rotation with lens distortion
 _LISTED: Final = 3  # photos without a pose in the warning, at most
+_ZOOM: Final = 1.1  # ratio of focal lengths, from which photos are zoomed; of one lens, it is below 1.02
+_OBSERVED: Final = 50  # points of a photo, from which its focal length is told
 _UNKNOWN: Final = 1.2  # focal length in longer sides of the photo: COLMAP's default guess
 _DIAGONAL_35MM: Final = math.hypot(36, 24)  # mm
 
@@ -100,7 +102,40 @@ def _models(pycolmap: Any, photos: Mapping[Path, Header], work: Path, settings: 
                 "%s: EXIF's focal length (%s on 35 mm film) is not used: %d of %d photos are placed with it, %d without"
             )
             _log.warning(message, root, told, placed, count, more)
+    largest = max(models, key=lambda model: model.num_reg_images(), default=None)
+    if largest is not None and (zoom := _zoom(pycolmap, largest, settings.threads)) > _ZOOM:
+        message = "%s: the photos are zoomed: focal lengths of one camera differ by a factor of %.2g. Each photo gets its own."
+        _log.warning(message, root, zoom)
+        _forget_focal_lengths(pycolmap, database, settings.threads, share=False)
+        models = _mapped(pycolmap, work, count, settings)
     return models
+
+
+def _zoom(pycolmap: Any, model: Any, threads: int) -> float:
+    """The largest ratio of the focal lengths of photos that share a camera, if they are adjusted one by one.
+
+    The reprojection error does not tell zoomed photos: with one focal length for all, wrong poses explain them nearly as well.
+    """
+    own, numbers = pycolmap.Reconstruction(), list(model.reg_image_ids())
+    for number in numbers:
+        image = model.image(number)
+        camera = pycolmap.Camera(model.camera(image.camera_id).todict() | {"camera_id": number})
+        seen = np.array([point.xy for point in image.points2D])
+        copy = pycolmap.Image(image.name, keypoints=seen, camera_id=number, image_id=number)
+        own.add_camera_with_trivial_rig(camera)
+        own.add_image_with_trivial_frame(copy, image.cam_from_world())
+    for point in model.points3D.values():
+        own.add_point3D(point.xyz, point.track)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_extra_params = options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.solver_options.num_threads = threads
+    pycolmap.bundle_adjustment(own, options)
+    lengths: dict[int, list[float]] = {}
+    for number in numbers:
+        if own.image(number).num_points3D >= _OBSERVED:
+            lengths.setdefault(model.image(number).camera_id, []).append(own.camera(number).mean_focal_length())
+    return max((max(of) / min(of) for of in lengths.values()), default=1.0)
 
 
 def _mapped(pycolmap: Any, work: Path, count: int, settings: SfmSettings) -> list[Any]:
@@ -131,13 +166,23 @@ def _most_placed(models: Sequence[Any]) -> int:
     return max((model.num_reg_images() for model in models), default=0)
 
 
-def _forget_focal_lengths(pycolmap: Any, database: Path, threads: int) -> None:
-    """Reset the cameras' focal lengths to unknown, and verify the matched pairs again."""
+def _forget_focal_lengths(pycolmap: Any, database: Path, threads: int, *, share: bool = True) -> None:
+    """Reset the cameras' focal lengths to unknown, and verify the matched pairs again.
+
+    Args:
+        share: photos share the cameras that they shared; else each has its own.
+    """
     with pycolmap.Database.open(database) as opened:
         for camera in opened.read_all_cameras():
             size = camera.width, camera.height
             unknown = pycolmap.Camera.create_from_model_id(camera.camera_id, camera.model, _UNKNOWN * max(size), *size)
             opened.update_camera(unknown)
+        if not share:
+            opened.clear_frames()  # COLMAP's mapper makes frames and rigs of images that have none
+            opened.clear_rigs()
+            for image in opened.read_all_images():
+                camera = opened.write_camera(opened.read_camera(image.camera_id))
+                opened.update_image(pycolmap.Image(image.name, camera_id=camera, image_id=image.image_id))
         opened.clear_two_view_geometries()
     options = pycolmap.GeometricVerifierOptions()
     options.num_threads = threads

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from clear_strategies import files
 from clear_strategies.core.images import to_bytes
-from clear_strategies.data.photo_files import Header
+from clear_strategies.data.photo_files import Header, read_header
 from clear_strategies.data.readers import colmap, demo, features, photos, sfm
 from clear_strategies.data.readers.features import SfmSettings
 from clear_strategies.errors import DataError
@@ -228,26 +228,49 @@ def database_of(
     return found
 
 
-def test_photos_along_the_optical_axis_are_placed(tmp_path: Path) -> None:
-    """Of each pair, one photo lies behind the other. The features are exact projections of points."""
+def photos_of_points(work: Path, centers: Sequence[Sequence[float]], focals: Sequence[float]) -> tuple[dict, Path]:
+    """Photos of 640x480, turned by up to 20 degrees, that share a camera; and COLMAP's database of their matched features, which
+    are projections of 400 points with noise of 0.2 pixels.
+    """
     rng = np.random.default_rng(0)
     points = rng.uniform((-3, -2, 4), (3, 2, 9), (400, 3))
-    ahead = np.array([0.0, 0.7, 1.4, 2.1])
-    (tmp_path / features.COPIES).mkdir()
-    with pycolmap.Database.open(tmp_path / features.DATABASE) as database:
-        camera = database.write_camera(pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 520.0, 640, 480))
-        for number, z in enumerate(ahead):
-            Image.new("RGB", (640, 480)).save(tmp_path / features.COPIES / sfm.copy_name(number))
+    (work / "photos").mkdir()
+    with pycolmap.Database.open(work / features.DATABASE) as database:
+        camera = database.write_camera(pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 768.0, 640, 480))
+        for number, (center, focal) in enumerate(zip(centers, focals, strict=True)):
+            Image.new("RGB", (640, 480)).save(work / "photos" / f"{number}.png")
             image = database.write_image(pycolmap.Image(sfm.copy_name(number), camera_id=camera))
-            seen = 520 * points[:, :2] / (points[:, 2:] - z) + (320, 240)
-            database.write_keypoints(image, (seen + rng.normal(size=seen.shape) * 0.2).astype(np.float32))
-        for one, other in itertools.combinations(range(1, 5), 2):
+            x, y, z = Rotation.from_euler("y", -8 * center[0], degrees=True).apply(points - center).T
+            seen = focal * np.stack((x / z, y / z), -1) + (320, 240) + rng.normal(size=(400, 2)) * 0.2
+            database.write_keypoints(image, seen.astype(np.float32))
+        for one, other in itertools.combinations(range(1, len(centers) + 1), 2):
             database.write_matches(one, other, np.arange(400, dtype=np.uint32)[:, None].repeat(2, 1))
-    pycolmap.geometric_verification(tmp_path / features.DATABASE, pycolmap.GeometricVerifierOptions())
-    (model,) = sfm._mapped(pycolmap, tmp_path, 4, SfmSettings(threads=1))
-    centers = np.array([model.images[i].projection_center() for i in range(1, 5)])
-    steps = np.linalg.norm(centers - centers[0], axis=1)
-    assert steps / steps[-1] == pytest.approx(ahead / ahead[-1], abs=0.01)
+    pycolmap.geometric_verification(work / features.DATABASE, pycolmap.GeometricVerifierOptions())
+    return {path: read_header(path) for path in sorted((work / "photos").iterdir())}, work / features.DATABASE
+
+
+@pytest.mark.parametrize(
+    ("centers", "focals", "told"),
+    [
+        ([(0, 0, z) for z in (0, 0.7, 1.4, 2.1)], [520] * 4, ""),  # along the optical axis, one behind the other
+        ([(x, 0, x * x / 8) for x in (-2, -1, 0, 1, 2)], [520, 800, 520, 800, 520], "the photos are zoomed"),
+    ],
+)
+def test_photos_are_placed_however_the_camera_moves_and_zooms(
+    centers, focals, told: str, tmp_path, monkeypatch, caplog
+):
+    files, database = photos_of_points(tmp_path, centers, focals)
+    monkeypatch.setattr(features, "find_and_match", lambda *_: database)
+    (model,) = sfm._models(pycolmap, files, tmp_path, SfmSettings(threads=1))
+    images = [model.images[number] for number in range(1, len(files) + 1)]
+    lengths = np.array([model.cameras[image.camera_id].focal_length for image in images])
+    # Along the axis, only the ratios can be known.
+    assert lengths / lengths[0] == pytest.approx(np.divide(focals, focals[0]), rel=0.02)
+    steps, true = (
+        np.linalg.norm(np.asarray(c) - c[0], axis=1) for c in ([i.projection_center() for i in images], centers)
+    )
+    assert steps / steps[-1] == pytest.approx(true / true[-1], abs=0.02)
+    assert (told in caplog.text) if told else not caplog.text
 
 
 def test_a_photo_without_a_pose_is_told_with_the_placed_photo_that_it_has_most_in_common_with(tmp_path: Path) -> None:
