@@ -27,14 +27,16 @@ class Estimate:
 
 def confirm(
     estimate: Estimate, others: Sequence[Estimate], settings: StereoSettings
-) -> tuple[Int[Tensor, "H W"], Float[Tensor, "H W"]]:
-    """(number of others that agree at each pixel, mean inverse depth over those and the photo itself).
+) -> tuple[Int[Tensor, "H W"], Int[Tensor, "H W"], Float[Tensor, "H W"]]:
+    """(number of others that agree at each pixel, number of others whose frame contains its point, mean inverse depth over those
+    that agree and the photo itself).
 
     Each pixel's point is projected into the others, and the point at their depth there is projected back. A photo agrees if the
     relative difference of the depths is at most `tolerance`, and the distance from the pixel at most `reprojection` pixels.
     """
     height, width = estimate.inverse_depth.shape
     agreeing = torch.zeros(height, width, dtype=torch.long, device=estimate.inverse_depth.device)
+    seeing = torch.zeros_like(agreeing)
     total = estimate.inverse_depth.double()
     column = torch.arange(width, device=total.device) + 0.5
     row = (torch.arange(height, device=total.device) + 0.5)[:, None]
@@ -47,8 +49,9 @@ def confirm(
         near = (u - column).square() + (v - row).square() <= settings.reprojection**2
         agrees = seen & ahead & same & near
         agreeing += agrees
+        seeing += seen
         total = total + torch.where(agrees, 1 / back.double(), 0.0)
-    return agreeing, (total / (agreeing + 1)).float()
+    return agreeing, seeing, (total / (agreeing + 1)).float()
 
 
 def reproject(

@@ -24,7 +24,7 @@ from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
-_MANY_PHOTOS = 12  # number of photos from which two others must agree
+_MANY_PHOTOS = 12  # number of photos from which two others must agree, if so many see a point
 _CONFIRMING = 8  # largest number of photos that confirm the depth of one
 _FEW_POINTS = 10  # triangulated points in a photo, below which its depth is not checked by them
 _LIKE = 0.05  # relative difference of depth up to which neighbouring pixels show one surface
@@ -61,9 +61,9 @@ def depth_maps(
             maps.append(_unknown(photo, "no other photo sees the same surfaces from 1 to 45 degrees aside"))
             continue
         others = [e for j in compared[i].others[:_CONFIRMING] if (e := estimates[j]) is not None]
-        agreeing, inverse_depth = confirm(estimate, others, settings)
-        good = agreeing >= min(needed, len(others))
-        good &= (estimate.correlation >= settings.min_correlation) & (agreeing > 0)
+        agreeing, seeing, inverse_depth = confirm(estimate, others, settings)
+        # Photos that look outward overlap with their neighbours alone: of many, too, one other may see a point.
+        good = (agreeing >= seeing.clamp(1, needed)) & (estimate.correlation >= settings.min_correlation)
         if background is not None:
             good &= ~is_background(photo.image, background)
         good &= photo.visible

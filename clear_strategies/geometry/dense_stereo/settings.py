@@ -30,7 +30,8 @@ class StereoSettings:
         min_correlation: least correlation of the windows at the depth found, in [0, 1]; with less, depth is unknown.
         tolerance: largest relative difference between the depths that two photos find of one point.
         reprojection: largest distance of a pixel from itself after going to the other photo and back, LR px.
-        agreeing: number of other photos whose depth must agree; None: 2 of at least 12 photos, else 1.
+        agreeing: number of other photos whose depth must agree, or all that see the point if they are fewer; None: 2 of at least
+            12 photos, else 1.
         speckle: depth in groups of fewer connected pixels than this is unknown; 0: none is. Needs SciPy.
         spacing: distance of the points on the surface, LR px of the photo that sees them.
         trust: least share of a photo's pixels with known depth; with less, all of its depth is unknown.

@@ -169,6 +169,15 @@ def test_depth_behind_most_triangulated_points_is_not_trusted(caplog: pytest.Log
     assert "triangulated points lie in front of its depth" in caplog.text
 
 
+def test_two_photos_must_confirm_a_depth_only_where_two_see_the_point() -> None:
+    shown = plane_photos(6, 64, 48)
+    photos = [shown[0], shown[1], shown[5]]  # the first shares columns 10… with the second, and 50… with the third
+    one, two = (depth_maps(photos, NONE, replace(QUICK, agreeing=count))[0] for count in (1, 2))
+    assert torch.equal(two.known[:, 10:46], one.known[:, 10:46])
+    assert two.known[:, 10:46].float().mean() > 0.8
+    assert (two.depth / 4 - 1).abs()[two.known].median() < 0.01
+
+
 def map_with_islands() -> torch.Tensor:
     depth = torch.full((12, 16), torch.nan)
     depth[:, :8] = torch.linspace(2.0, 2.6, 8)  # a slanted surface: neighbours differ by 4 %
