@@ -124,9 +124,7 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     order = _tour(centers)
     order = order[:: -(-len(order) // _MOST_KEYS)]
     # Photos that were taken upside down are turned: else the path would roll to each and back.
-    down = axes[order, :, 1]
-    signs = np.cumprod([1.0, *np.where((down[1:] * down[:-1]).sum(1) < 0, -1.0, 1.0)])
-    axes[order, :, :2] *= (signs if signs.sum() >= 0 else -signs)[:, None, None]
+    axes[order, :, :2] *= _upright(axes[order, :, 1])[:, None, None]
     steps = np.linalg.norm(centers[order] - centers[np.roll(order, 1)], axis=1)  # the first is that between the ends
     if steps[0] > _FAR * steps[1:].max(initial=0):
         order += order[-2:0:-1]
@@ -141,6 +139,22 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     poses[:, :3, :3] = RotationSpline(at, rotations)(times).inv().as_matrix()
     poses[:, :3, 3:] = -poses[:, :3, :3] @ CubicSpline(at, centers[keys])(times)[..., None]
     return [replace(cameras[0], world_to_camera=torch.from_numpy(pose)) for pose in poses]
+
+
+def up(cameras: Sequence[Camera]) -> Float[np.ndarray, " 3"]:
+    """The mean of the cameras' upward axes, of length 1; cameras that were held upside down are turned."""
+    down = np.stack([camera.world_to_camera[1, :3].double().cpu().numpy() for camera in cameras])
+    down = down[_tour(np.stack([camera.center.double().cpu().numpy() for camera in cameras]))]
+    mean: Float[np.ndarray, " 3"] = -(_upright(down)[:, None] * down).mean(0)
+    mean /= max(np.linalg.norm(mean), 1e-9)
+    return mean
+
+
+def _upright(down: Float[np.ndarray, "C 3"]) -> Float[np.ndarray, " C"]:
+    """-1 for cameras that were held upside down, else 1, from their downward axes in the order of a tour; most are upright."""
+    changes = np.where((down[1:] * down[:-1]).sum(1) < 0, -1.0, 1.0)
+    signs: Float[np.ndarray, " C"] = np.cumprod([1.0, *changes])
+    return signs if signs.sum() >= 0 else -signs
 
 
 def _tour(centers: Float[np.ndarray, "C 3"]) -> list[int]:

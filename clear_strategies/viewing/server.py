@@ -33,6 +33,7 @@ from clear_strategies import signals
 from clear_strategies.core.images import to_bytes
 from clear_strategies.errors import one_line
 from clear_strategies.geometry.cameras import looked_at
+from clear_strategies.viewing.cameras import up
 from clear_strategies.viewing.look import Painter, Pixels, colored, depth_range
 from rasterizers.interface import Camera
 
@@ -240,8 +241,7 @@ def watched(
 
 def _aim(server: viser.ViserServer, cameras: Sequence[Camera]) -> None:
     """Set the initial view: from the first camera, at the point on its axis as far away as the point that all look at."""
-    up = -torch.stack([camera.world_to_camera.double() for camera in cameras])[:, 1, :3].mean(0)
-    server.scene.set_up_direction(tuple((up / up.norm().clamp_min(1e-9)).tolist()))
+    server.scene.set_up_direction(up(cameras))
     first, view = cameras[0], server.initial_camera
     view.position, view.look_at, view.up = _look_at(first, looked_at(cameras))
     view.fov = 2 * math.atan(first.height / 2 / first.fy)

@@ -117,12 +117,14 @@ def test_a_path_along_an_arc_comes_back_along_it_and_not_through_the_scene():
 
 
 @pytest.mark.parametrize("upside_down", [[0], range(1, 12, 2), range(4, 12)])
-def test_a_path_past_photos_that_were_taken_upside_down_does_not_roll(upside_down):
+def test_a_path_past_photos_that_were_taken_upside_down_does_not_roll_and_the_viewer_stands_upright(upside_down):
     turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
     ring = [replace(c, world_to_camera=turn @ c.world_to_camera) if i in upside_down else c for i, c in enumerate(RING)]
     down = np.stack([frame.world_to_camera[1, :3].numpy() for frame in cameras.through(ring, 60)])
     assert np.abs(down[:, 1]).min() > 0.99
     assert (down[:, 1] > 0).all() == (len(upside_down) < 7)  # as most photos are
+    sign = 1 if len(upside_down) < 7 else -1
+    np.testing.assert_allclose(cameras.up(ring), (0, -sign, 0), atol=0.02)  # the viewer's
 
 
 def test_many_cameras_are_thinned():
