@@ -17,6 +17,7 @@ from clear_strategies.core.checks import refuse, require_choice, require_number,
 from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.capture import BLACK, SfmPoints
+from clear_strategies.data.depth_files import DepthFile, completed_by_files
 from clear_strategies.data.ply import read_points
 from clear_strategies.errors import DataError, counted
 from clear_strategies.geometry.cameras import common_box
@@ -68,6 +69,9 @@ class CloudSettings:
             photos, except before a plain background. "auto": as "hr", but with more than five photos no SR images, since the
             LR photos then give the same depth in a fraction of the time.
         max_points: a larger cloud is reduced to this many points, chosen at random.
+        depth: for init=stereo and auto: a folder with a depth file for each training photo, of a sensor or a network, which
+            completes stereo where it finds no depth: z along the camera's axis in any unit, as .npy or in PNG or TIFF of 16
+            or 32 bits, with the photo's name. None: stereo alone.
         triangulation: for init=stereo, triangulated and auto.
         stereo: for init=stereo and auto.
     """
@@ -85,6 +89,7 @@ class CloudSettings:
     voxel: float | None = None
     compare: Compare = "auto"
     max_points: int = MAX_POINTS
+    depth: str | None = None
     triangulation: TriangulationSettings = field(default_factory=TriangulationSettings)
     stereo: StereoSettings = field(default_factory=StereoSettings)
 
@@ -92,6 +97,13 @@ class CloudSettings:
         require_choice("data.cloud.init", self.init, get_args(Init))
         if self.init == "ply" and not self.path:
             refuse("data.cloud.path", "init=ply needs a PLY file", self.path, "add data.cloud.path=…")
+        if self.depth is not None and self.init not in ("stereo", "auto"):
+            refuse(
+                "data.cloud.depth",
+                "completes stereo, of init=stereo and auto",
+                self.depth,
+                f"leave out init={self.init}",
+            )
         require_choice("data.cloud.compare", self.compare, get_args(Compare))
         require_choice("data.cloud.densify", self.densify, (True, False, "auto"))
         for name in ("min_views", "enough", "stride", "random_points", "max_points"):
@@ -127,6 +139,7 @@ def initial_points(
     *,
     hr: Sequence[Photo] = (),
     hr_is_photo: bool = False,
+    files: Sequence[DepthFile] = (),
     sfm: SfmPoints | None = None,
     train_ids: Sequence[int] = (),
     sfm_is_train: bool = False,
@@ -139,6 +152,7 @@ def initial_points(
         photos: the training views at LR.
         hr: the same views at HR, see `CloudSettings.compare`; empty: stereo compares `photos`.
         hr_is_photo: the HR images are photos, not SR images.
+        files: the depth files of the views, see `CloudSettings.depth`; empty: there are none.
         sfm: the scene's SfM points; None: it has none.
         train_ids: ids of the training frames in `SfmPoints.track_image`.
         sfm_is_train: every photo of the capture is a training view, so init=auto may take the SfM points as features.
@@ -169,7 +183,7 @@ def initial_points(
                 _log.debug("init: auto does not use the scene's own points, because test views were used for them.")
             features = triangulate(shown, settings.triangulation) if known is None else known
             shown_hr = [blackened(photo) for photo in hr]
-            initial = _from_depth(settings, shown, shown_hr, hr_is_photo, features, background)
+            initial = _from_depth(settings, shown, shown_hr, hr_is_photo, files, features, background)
             if initial is None and len(features) >= settings.enough:
                 initial = _cleaned(settings, features, shown, background)
             if initial is None:
@@ -201,6 +215,7 @@ def _from_depth(
     lr: Sequence[Photo],
     hr: Sequence[Photo],
     hr_is_photo: bool,
+    files: Sequence[DepthFile],
     features: PointCloud,
     background: Color | None,
 ) -> InitialPoints | None:
@@ -222,6 +237,8 @@ def _from_depth(
             images = [photo.reduced(divisor) for photo in hr]
             finest = depth_maps(images, features.means, stereo.finer(by), background)
             maps = [map_lr.completed_by(map_sr.reduced(by)) for map_lr, map_sr in zip(maps, finest, strict=True)]
+    if files:
+        maps = completed_by_files(maps, files, photos, features.means, background)
     cloud = stereo_cloud(
         features, photos, maps, stereo, background=background, fill=settings.densify is not False,
         stride=round(finer * settings.stride),  # completed points stay as few as at LR
@@ -230,6 +247,8 @@ def _from_depth(
     if cloud is None and settings.init == "stereo":
         none = f"stereo confirms no depth in any of the {len(lr)} training LR images"
         raise DataError("scene", "points", none, "use init=triangulated or random, or closer views")
+    if cloud is not None and files:  # of a sensor, or of a network that may have seen any photo
+        cloud = replace(cloud, source=f"{cloud.source}, with depth files", uses_test_views="unknown")
     return None if cloud is None else InitialPoints(cloud, tuple(maps))
 
 

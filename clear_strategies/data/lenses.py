@@ -108,6 +108,15 @@ class Lens:
         result = cv2.remap(image.numpy(), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         return torch.from_numpy(result).clamp(0, 1)
 
+    def sampled(self, values: Float[np.ndarray, "H W"], pinhole: Lens) -> Float[np.ndarray, "h w"]:
+        """The nearest of the values at each pixel of `pinhole`, a lens of any size and cut, float32; nan beyond the edges."""
+        import cv2
+
+        x, y = _sampling_maps(self, pinhole)
+        return cv2.remap(
+            values.astype(np.float32), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=math.nan
+        )
+
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         """K in OpenCV's convention: the first pixel is centred at (0, 0)."""
         return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1.0]])
@@ -221,11 +230,11 @@ def _covers(lens: Lens, pinhole: Lens) -> bool:
 
 
 @lru_cache(maxsize=1)
-def _sampling_maps(lens: Lens, pinhole: Lens) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
-    """The position of each undistorted pixel in the distorted image."""
+def _sampling_maps(lens: Lens, pinhole: Lens) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+    """The position of each pixel of `pinhole` in the distorted image."""
     import cv2
 
-    maps, size = (cv2.fisheye if lens.fisheye else cv2).initUndistortRectifyMap, (lens.width, lens.height)
+    maps, size = (cv2.fisheye if lens.fisheye else cv2).initUndistortRectifyMap, (pinhole.width, pinhole.height)
     x, y = maps(lens.matrix(), lens.coefficients, np.eye(3), pinhole.matrix(), size, cv2.CV_32FC1)
     return x, y
 

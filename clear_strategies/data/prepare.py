@@ -24,6 +24,7 @@ from clear_strategies.core.view import SMALLEST, Photo, View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.capture import NO_PARALLAX, STEP_ASIDE, Capture, Frame
 from clear_strategies.data.cloud import CloudSettings, initial_points, require_source
+from clear_strategies.data.depth_files import depth_files
 from clear_strategies.data.lenses import forget_maps
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.priors import Bicubic, Prior
@@ -61,6 +62,7 @@ def prepare(
     frames = [*train_frames, *map(_opaque, test_frames)]
     lr_files = check_headers(frames, views)
     require_source(cloud, capture.points)
+    files = () if cloud.depth is None else depth_files(Path(cloud.depth), train_frames)
     _check_positions(capture, [frame.camera for frame in train_frames], cloud)
     progress = Progress("photos and their SR images", "photos", len(frames))
     made, work_log = list[View](), WorkLog() if work_log is None else work_log
@@ -72,7 +74,7 @@ def prepare(
     require_shown(train)
     with work_log.stage("initial points"):
         initial = initial_points(
-            cloud, [v.lr for v in train], hr=[v.hr for v in train], hr_is_photo=views.photos_are == "both",
+            cloud, [v.lr for v in train], hr=[v.hr for v in train], hr_is_photo=views.photos_are == "both", files=files,
             sfm=capture.points, train_ids=[frame.sfm_id for frame in train_frames if frame.sfm_id is not None],
             sfm_is_train=len(train) == len(capture.frames), background=capture.background, seed=seed,
         )  # fmt: skip
