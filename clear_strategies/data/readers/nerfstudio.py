@@ -91,6 +91,9 @@ def read(
         if counts[None]:
             message = "%s: %s in none of its split lists, so not used; data.views.own_split=false uses all."
             _log.warning(message, file, counted(counts[None], "frame"))
+    if depth := next((transform.depth_file_path for transform in transforms if transform.depth_file_path), None):
+        message = "%s names depth files, which complete stereo with data.cloud.depth=%s."
+        _log.info(message, file, finder(folder)(depth).parent)
     return Capture(folder.resolve().name, sorted_by_name(frames, file), points_of(file, content), background, notes)
 
 
@@ -134,6 +137,7 @@ class Transform(msgspec.Struct):
 
     file_path: str = ""
     mask_path: str | None = None
+    depth_file_path: str | None = None
     transform_matrix: Any = None
     w: Number | None = None
     h: Number | None = None

@@ -61,7 +61,10 @@ def test_a_photo_is_found_however_its_name_is_written(kind: str, case: str, tmp_
     assert [Path(frame.name).stem for frame in capture.frames] == ["a", "b", "c"]
 
 
-def test_masks_points_and_split_lists_are_found_by_the_same_rule(tmp_path: Path) -> None:
+def test_masks_points_and_split_lists_are_found_by_the_same_rule_and_depth_files_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
     root = tiny.nerfstudio(tmp_path)
     write_points(root / "points.ply", torch.zeros(1, 3), torch.zeros(1, 3))
     (root / "m").mkdir()
@@ -70,12 +73,14 @@ def test_masks_points_and_split_lists_are_found_by_the_same_rule(tmp_path: Path)
     def change(value: dict[str, Any]) -> None:
         value.update(ply_file_path=".\\Points.ply", train_filenames=["images\\a.png", "images\\b.png"])
         value["frames"][0]["mask_path"] = "m\\A.png"
+        value["frames"][1]["depth_file_path"] = ".\\depth\\b.png"
 
     tiny.edit(root / "transforms.json", change)
     capture = nerfstudio.read(root)
     assert len(capture.points.means) == 1
     assert [frame.split for frame in capture.frames] == ["train", "train", None]
     assert not capture.frames[0].load().shown.any()
+    assert f"data.cloud.depth={root / 'depth'}." in caplog.text
 
 
 def test_two_files_that_a_name_could_mean_are_not_chosen_from(tmp_path: Path) -> None:
