@@ -6,6 +6,7 @@ import logging
 import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -13,6 +14,8 @@ from typing import Any, Final
 import msgspec
 import pandas as pd
 
+from clear_strategies.data.photo_files import read_header
+from clear_strategies.data.view_names import file_stems
 from clear_strategies.errors import DataError, counted
 from clear_strategies.files import FINISHED
 from clear_strategies.outputs import metrics
@@ -47,7 +50,8 @@ class FinishedRun:
             `_with_settings_of_files`.
         numbers: mean scores of the test views, or of the training views if there are no test views, those of the run's own
             metrics as "metrics.<name>"; "bicubic", "prior": PSNR of these images; conflict, gaussians, seconds. NaN: unknown.
-        views: the names of the scored views. config: every setting, by its dotted key.
+        views: the names of the scored views. size: "WIDTHxHEIGHT", px, at which the first of them with a picture is scored;
+            empty: unknown. config: every setting, by its dotted key.
         job: its number in a sweep, None without one; ended: when, UTC, empty if unknown; keys: of all overrides that may change a
             result, but of methods and strategies, which take each other's place; the jobs of a sweep share them.
     """
@@ -61,6 +65,7 @@ class FinishedRun:
     seed: int
     numbers: Mapping[str, float]
     views: tuple[str, ...]
+    size: str
     config: Mapping[str, Any]
     job: int | None
     ended: str
@@ -103,7 +108,8 @@ class FinishedRun:
                 "gaussians": content.gaussians,
                 "seconds": content.seconds,
             },
-            views=tuple(sorted(part.views)),
+            views=(views := tuple(sorted(part.views))),
+            size=_size_of(folder, views, "lr" if part.against_lr else "truth"),
             config=content.config,
             job=int(job[1]) if job else None,
             ended=str(content.provenance.get("date", "")),
@@ -143,7 +149,7 @@ def collect(folders: Iterable[Path]) -> list[FinishedRun]:
 
 
 def _with_distinct_scenes(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
-    """Rename scenes of the same name that are not the same, since their photos or their scored views differ."""
+    """Rename scenes of the same name that are not the same, since their photos, scored views or sizes differ."""
     cameras = {
         run: file.read_text(encoding="utf-8") if (file := run.folder / CAMERAS).is_file() else str(file) for run in runs
     }
@@ -158,12 +164,15 @@ def _with_distinct_scenes(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
         scene = run.scene
         if len(places := {photos[other] for other in of}) > 1:
             scene = f"{scene} of {_shortest(photos[run], places)}"
-        if len({other.views for other in of if photos[other] == photos[run]}) > 1:
+        same = [other for other in of if photos[other] == photos[run]]
+        if len({other.views for other in same}) > 1:
             some = ", ".join(run.views[:3]) + (", …" if len(run.views) > 3 else "")
             scene = f"{scene}, {counted(len(run.views), 'view')}: {some}"
+        if len({other.size for other in same if other.views == run.views} - {""}) > 1:
+            scene = f"{scene}, scored at {run.size or 'an unknown size'}"
         apart.append(replace(run, scene=scene))
     for scene in dict.fromkeys(run.scene for run, other in zip(runs, apart, strict=True) if run.scene != other.scene):
-        _log.warning("%s: runs of other photos, or scored on other views, are not compared.", scene)
+        _log.warning("%s: runs of other photos, or scored on other views or at other sizes, are not compared.", scene)
     return apart
 
 
@@ -220,6 +229,15 @@ def _in_order(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
     parents = [run.folder.parent for run in runs]
     in_sweeps = [sweep[job] for sweep in sweeps for job in sorted(sweep)]
     return sorted(in_sweeps, key=lambda run: parents.index(run.folder.parent))
+
+
+def _size_of(folder: Path, views: Iterable[str], kind: str) -> str:
+    """The size of the first picture of this kind that the run has kept of these views; empty if there is none."""
+    pictures = (folder / "views" / f"{stem}_{kind}.png" for stem in file_stems(views).values())
+    with suppress(DataError, StopIteration):
+        width, height = read_header(next(filter(Path.is_file, pictures))).stored
+        return f"{width}x{height}"
+    return ""
 
 
 def _hydra(folder: Path) -> str:

@@ -512,7 +512,7 @@ def test_sweeps_in_one_folder_stand_one_after_the_other_also_one_that_was_resume
     assert [run.name for run in report.collect([tmp_path])] == in_order
 
 
-def test_scenes_of_one_name_with_other_photos_or_other_views_are_no_one_scene(tmp_path, caplog):
+def test_scenes_of_one_name_with_other_photos_views_or_sizes_are_no_one_scene(tmp_path, caplog):
     def made(folder: str, path: str, cameras: str, **facts: Any) -> None:
         run = make_run(tmp_path / folder, "+strategy=clear", scene="photos", config={"data.path": path}, **facts)
         files.write_text(run / "cameras.json", cameras)
@@ -525,7 +525,27 @@ def test_scenes_of_one_name_with_other_photos_or_other_views_are_no_one_scene(tm
     scenes = [run.scene for run in report.collect([tmp_path])]
     assert scenes[0] == scenes[1] == "photos of one/photos"
     assert scenes[2:] == ["photos of two/photos, 1 view: view.png", "photos of two/photos, 1 view: other.png"]
-    assert "photos: runs of other photos, or scored on other views, are not compared" in caplog.text
+    assert "photos: runs of other photos, or scored on other views or at other sizes, are not compared" in caplog.text
+
+
+@pytest.mark.parametrize(("against", "scored"), [("HR photos", "truth"), ("LR photos", "lr")])
+def test_runs_of_one_scene_are_compared_only_at_the_size_at_which_both_are_scored(against, scored, tmp_path, caplog):
+    """Against LR photos, HR may be of any size."""
+    other = {"truth": "lr", "lr": "truth"}[scored]
+    views = {"cam/view.png": {"ours": scores(20.0)}}
+    test = {"against": against, "views": views, "mean": {"ours": scores(20.0)}}
+    for folder, height, width in (("a", 24, 32), ("b", 24, 32), ("c", 48, 64)):
+        run = make_run(tmp_path / folder, "+strategy=clear", test=test)
+        write_png(run / "views" / f"cam_view_{scored}.png", torch.zeros(height, width, 3))
+        write_png(run / "views" / f"cam_view_{other}.png", torch.zeros(8, 8 + ord(folder), 3))
+    marks = "" if against == "HR photos" else f" (against {against})"
+    sizes = ["32x24", "32x24", "64x48"]
+    assert [run.scene for run in report.collect([tmp_path])] == [f"demo{marks}, scored at {size}" for size in sizes]
+    assert "at other sizes, are not compared" in caplog.text
+    caplog.clear()
+    (run / "views" / f"cam_view_{scored}.png").write_bytes(b"damaged")
+    assert {run.scene for run in report.collect([tmp_path])} == {f"demo{marks}"}
+    assert not caplog.text
 
 
 def test_damaged_and_unfinished_runs_are_left_out_with_a_warning(tmp_path, caplog):
