@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import shlex
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -231,7 +232,8 @@ def describe(folder: Path, evaluation: Evaluation, seconds: float, parts: Mappin
         lines.append(f"  {unknown}: the HR photos are unknown, so reduced images are compared with the LR photos.")
     if train.views and len(train.views) < (train.of or 0):
         lines.append(f"  train: {len(train.views)} of the {train.of} views, evenly spaced, are scored.")
-    look = f"{folder / 'contact_sheet.jpg'}, or clear-strategies view {shlex.quote(str(folder))}"
+    run = shlex.quote(re.sub("^-", "./-", str(folder)))  # else it would be read as an option
+    look = f"{folder / 'contact_sheet.jpg'}, or clear-strategies view {run}"
     return "\n".join([*lines, f"  look next: {look}"])
 
 

@@ -148,6 +148,12 @@ def test_the_images_that_ours_is_compared_with_stand_below_it() -> None:
     assert look_next == "  look next: run/contact_sheet.jpg, or clear-strategies view run"
 
 
+@pytest.mark.parametrize(("folder", "shown"), [("a run", "'a run'"), ("-lead", "./-lead"), ("-a run", "'./-a run'")])
+def test_the_command_that_shows_the_run_can_be_copied(folder: str, shown: str) -> None:
+    text = describe(Path(folder), Evaluation(part(SCORES), part({}), {}), 1.0, {})
+    assert text.endswith(f"or clear-strategies view {shown}")
+
+
 def test_what_is_missing_has_no_row_and_no_note() -> None:
     def told(test: dict[str, ImageScores], train: dict[str, ImageScores], against: str = "HR photos") -> str:
         return describe(Path("run"), Evaluation(part(test), part(train, against, 200), {}), 12.7, {})
