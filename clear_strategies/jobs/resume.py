@@ -83,7 +83,7 @@ def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]
             _require_same_photos(folder, checkpoint.load(last), fingerprints(there))
     psnr, date = content.psnr, content.provenance.get("date", "an unknown date")
     score = "no PSNR" if psnr is None or math.isnan(psnr) else f"PSNR {psnr:.2f} dB"
-    _log.info("%s: this run finished on %s (%s); nothing is trained.", folder, date, score)
+    _log.info("%s: this run finished on %s (%s); nothing is trained or written.", folder, date, score)
     return content
 
 

@@ -37,8 +37,8 @@ class FitSettings:
         verbose: also show on the console the details that run.log holds; `-v` on the command line.
         viewer: open the viewer in the browser while the run trains; the address is logged. Needs the extra [view].
         resume: a run's folder or one of its checkpoints, from which the run continues bit for bit. With "auto", the run's own
-            folder: if the run is finished, nothing is trained; if it has checkpoints, it continues from the newest one; else
-            it starts from the beginning.
+            folder: if the run is finished, nothing is trained or written; if it has checkpoints, it continues from the newest
+            one; else it starts from the beginning.
         overwrite: if there is a run in the folder already, remove its checkpoints and results, and train. If false, this is
             refused, unless `resume` is set. Cannot be combined with resume="auto", which experiments set.
         device: where field, views and optimizer are, cpu or cuda. None: cuda if torch finds it and the rasterizer draws there,
