@@ -70,7 +70,7 @@ def describe(error: BaseException) -> Ending | None:
         remedy = f"{_FIRST.get(disk.errno or 0, 'Write')} elsewhere"
         folders = "hydra.run.dir=FOLDER of a run, hydra.sweep.dir=FOLDER of a sweep"
         elsewhere = f"{folders}, --out of a command, $CLEAR_CACHE of the cache"
-        return Ending(NO_DISK, f"{where}. {remedy} ({elsewhere}). Earlier checkpoints are untouched.")
+        return Ending(NO_DISK, f"{where}. {remedy} ({elsewhere}). Earlier checkpoints, if any, are untouched.")
     return None
 
 
