@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any, Final
@@ -40,6 +41,9 @@ _LISTED: Final = 3  # photos without a pose in the warning, at most
 _ZOOM: Final = 1.1  # ratio of focal lengths, from which photos are zoomed; of one lens, it is below 1.02
 _OBSERVED: Final = 50  # points of a photo, from which its focal length is told
 _UNKNOWN: Final = 1.2  # focal length in longer sides of the photo: COLMAP's default guess
+_LITTLE_PARALLAX: Final = (
+    "too little parallax: the photos are from nearly one place, which does not tell how far away anything is"
+)
 _DIAGONAL_35MM: Final = math.hypot(36, 24)  # mm
 
 
@@ -108,6 +112,8 @@ def _models(pycolmap: Any, photos: Mapping[Path, Header], work: Path, settings: 
         _log.warning(message, root, zoom)
         _forget_focal_lengths(pycolmap, database, settings.threads, share=False)
         models = _mapped(pycolmap, work, count, settings)
+    if not (models := _sound(pycolmap, models)):
+        _require_unmatched(pycolmap, database, root)
     return models
 
 
@@ -159,6 +165,17 @@ def _mapped(pycolmap: Any, work: Path, count: int, settings: SfmSettings) -> lis
         next_image_callback=lambda: progress(next(placed)),
     )
     return list(models.values())
+
+
+def _sound(pycolmap: Any, models: Sequence[Any]) -> list[Any]:
+    """Remove photos without points or with diverged cameras, as COLMAP does from 20 photos on; returns models with points."""
+    limits = pycolmap.IncrementalPipelineOptions()
+    cameras = limits.min_focal_length_ratio, limits.max_focal_length_ratio, limits.max_extra_param
+    for model in models:
+        for frame in pycolmap.ObservationManager(model).filter_frames(*cameras, 1):
+            model.deregister_frame(frame)
+        model.tear_down()  # forgets what is not registered
+    return [model for model in models if model.num_points3D()]
 
 
 def _most_placed(models: Sequence[Any]) -> int:
@@ -220,6 +237,15 @@ def _require_parallax(pycolmap: Any, database: Path, root: Path) -> None:
 
     if min(map(distance_from_rotations, np.geomspace(0.3, 5.0, 60))) < _ROTATION:
         raise DataError(root, "poses", NO_PARALLAX, STEP_ASIDE)
+
+
+def _require_unmatched(pycolmap: Any, database: Path, root: Path) -> None:
+    """Raise a DataError if a photo matches two others: that no model came of them is then due to too little parallax."""
+    with pycolmap.Database.open(database) as opened:
+        pairs = list(zip(*opened.read_two_view_geometry_num_inliers(), strict=True))
+    trusted = [pycolmap.pair_id_to_image_pair(pair) for pair, matches in pairs if matches >= _MATCHED]
+    if any(count > 1 for count in Counter(itertools.chain(*trusted)).values()):
+        raise DataError(root, "poses", _LITTLE_PARALLAX, STEP_ASIDE)
 
 
 def _write_copies(photos: Mapping[Path, Header], folder: Path, max_side: int) -> features.Groups:

@@ -273,6 +273,29 @@ def test_photos_are_placed_however_the_camera_moves_and_zooms(
     assert (told in caplog.text) if told else not caplog.text
 
 
+@pytest.mark.parametrize(
+    "centers",
+    [
+        [(x / 10, 0, 0) for x in range(6)],  # the camera diverges: three photos were placed with it
+        [(x / 5, 0, 0) for x in range(4)],  # no model at all
+    ],
+)
+def test_too_little_parallax_is_told_as_such_where_photos_match_but_give_no_sound_model(centers, tmp_path, monkeypatch):
+    files, database = photos_of_points(tmp_path, centers, [520] * len(centers))
+    monkeypatch.setattr(features, "find_and_match", lambda *_: database)
+    with pytest.raises(DataError, match=r"too little parallax: .*: take a step to the side"):
+        sfm._models(pycolmap, files, tmp_path, SfmSettings(threads=1))
+
+
+def test_a_model_without_points_counts_as_none() -> None:
+    empty = pycolmap.Reconstruction()
+    empty.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 768.0, 640, 480))
+    for number in (1, 2, 3):
+        photo = pycolmap.Image(sfm.copy_name(number), keypoints=np.zeros((5, 2)), camera_id=1, image_id=number)
+        empty.add_image_with_trivial_frame(photo, pycolmap.Rigid3d())
+    assert sfm._sound(pycolmap, [empty]) == []
+
+
 def test_a_photo_without_a_pose_is_told_with_the_placed_photo_that_it_has_most_in_common_with(tmp_path: Path) -> None:
     pairs = {(0, 1): 300, (0, 2): 9, (1, 2): 14, (2, 3): 80}
     database_of(tmp_path / "database.db", {0: 1000, 1: 1000, 2: 1000, 3: 1000, 4: 7}, pairs)
