@@ -108,10 +108,13 @@ def _models(pycolmap: Any, photos: Mapping[Path, Header], work: Path, settings: 
             _log.warning(message, root, told, placed, count, more)
     largest = max(models, key=lambda model: model.num_reg_images(), default=None)
     if largest is not None and (zoom := _zoom(pycolmap, largest, settings.threads)) > _ZOOM:
-        message = "%s: the photos are zoomed: focal lengths of one camera differ by a factor of %.2g. Each photo gets its own."
-        _log.warning(message, root, zoom)
         _forget_focal_lengths(pycolmap, database, settings.threads, share=False)
-        models = _mapped(pycolmap, work, count, settings)
+        own = _sound(pycolmap, _mapped(pycolmap, work, count, settings))
+        models, told = (
+            (own, "Each photo gets its own") if _most_placed(own) >= FEWEST else (models, "Poses may be wrong")
+        )
+        message = "%s: the photos are zoomed: focal lengths of one camera differ by a factor of %.2g. %s."
+        _log.warning(message, root, zoom, told)
     if not (models := _sound(pycolmap, models)):
         _require_unmatched(pycolmap, database, root)
     return models

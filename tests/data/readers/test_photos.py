@@ -273,6 +273,18 @@ def test_photos_are_placed_however_the_camera_moves_and_zooms(
     assert (told in caplog.text) if told else not caplog.text
 
 
+def test_zoomed_photos_keep_their_poses_where_focal_lengths_of_their_own_give_none(tmp_path, monkeypatch, caplog):
+    files, database = photos_of_points(tmp_path, [(x, 0, 0) for x in range(4)], [520] * 4)
+    monkeypatch.setattr(features, "find_and_match", lambda *_: database)
+    monkeypatch.setattr(sfm, "_ZOOM", 0)
+    mapped, times = sfm._mapped, itertools.count()
+    monkeypatch.setattr(sfm, "_mapped", lambda *args: [] if next(times) else mapped(*args))
+    (model,) = sfm._models(pycolmap, files, tmp_path, SfmSettings(threads=1))
+    assert model.num_reg_images() == 4
+    assert "the photos are zoomed" in caplog.text
+    assert "Poses may be wrong" in caplog.text
+
+
 @pytest.mark.parametrize(
     "centers",
     [
