@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.progress import Progress
@@ -126,31 +125,43 @@ def _completed(
 
     Occluded points would distort the depth, so only the nearest point per square of `cell` pixels is used.
     """
-    _, row, column, depth = seen_pixels(photo.camera, means)
+    factor = photo.factor_to(_MAX_PIXELS)
+    small = photo.reduced(factor)
+    width, height = small.camera.width, small.camera.height
+    _, row, column, depth = seen_pixels(small.camera, means)
     order = torch.argsort(depth, stable=True)
-    square = row[order] // cell * photo.camera.width + column[order] // cell
+    side = max(1, cell // factor)
+    square = row[order] // side * width + column[order] // side
     _, first = np.unique(square.numpy(), return_index=True)
     nearest = order[torch.from_numpy(first)]
-    known = torch.full((photo.camera.height, photo.camera.width), torch.nan, dtype=torch.float64)
+    known = torch.full((height, width), torch.nan, dtype=torch.float64)
     confidence = torch.full_like(known, _OF_POINTS)
     known[row[nearest], column[nearest]] = 1 / depth[nearest]
     if depth_map is not None:
-        matched = depth_map.known.cpu()
-        known[matched], confidence[matched] = 1 / depth_map.depth.cpu()[matched].double(), 1.0
-    count = int(known.isfinite().sum())
-    if count < _FEWEST_SAMPLES:
-        _log.warning("depth of a view cannot be completed: only %d points project into it.", count)
-        return None
-    factor = photo.factor_to(_MAX_PIXELS)
-    small = photo.reduced(factor)
-    if factor > 1:  # the nearest depth and the largest confidence of each block
-        known, confidence = (max_pool2d(values[None], factor)[0] for values in (known.nan_to_num(0.0), confidence))
-        known[known == 0] = torch.nan
+        own = depth_map.to("cpu").reduced(factor)
+        known[own.known], confidence[own.known] = 1 / own.depth[own.known].double(), 1.0
     finite = known[known.isfinite()]
-    inverse_depth = completed(known, confidence, small.image)
-    inverse_depth = inverse_depth.clamp(finite.min() / _BEYOND, finite.max() * _BEYOND)
-    x, y = (at / factor).long().unbind(dim=1)
-    return inverse_depth[y.clamp(max=small.camera.height - 1), x.clamp(max=small.camera.width - 1)]
+    if len(finite) < _FEWEST_SAMPLES:
+        _log.warning("depth of a view cannot be completed: only %d points project into it.", len(finite))
+        return None
+    inverse_depth = _between(completed(known, confidence, small.image), at / factor)
+    return inverse_depth.clamp(finite.min() / _BEYOND, finite.max() * _BEYOND)
+
+
+def _between(values: Float[Tensor, "h w"], at: Float[Tensor, "G 2"]) -> Float[Tensor, " G"]:
+    """The values at these places (column, row) between the pixels' centres: that of the pixel, continued along each axis by the
+    smaller of its slopes to both sides. This is exact on planes, and continues no surface across an edge.
+    """
+    column, row = (x.long().clamp(max=n - 1) for x, n in zip(at.T, reversed(values.shape), strict=True))
+    result = values[row, column]
+    for axis, pixel, place in ((1, column, at[:, 0]), (0, row, at[:, 1])):
+        step = values.diff(dim=axis).movedim(axis, 0)
+        if len(step) == 0:  # one row or column
+            continue
+        before, after = torch.cat((step[:1], step)), torch.cat((step, step[-1:]))
+        slope = torch.where(before.abs() < after.abs(), before, after) * (before * after > 0)
+        result = result + slope.movedim(0, axis)[row, column] * (place - pixel - 0.5)
+    return result
 
 
 def completed(

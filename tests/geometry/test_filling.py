@@ -31,6 +31,22 @@ def test_new_points_lie_on_the_plane_of_the_old_ones(a: float, b: float, stride:
     assert f"densified by {len(new):,}" in cloud.source
 
 
+@pytest.mark.parametrize(("size", "stride"), [(40, 1), (40, 2), (40, 5), (300, 2), (300, 4), (300, 7)])
+def test_points_beside_an_exact_depth_map_lie_on_its_plane_wherever_they_are_in_their_pixel(
+    size: int, stride: int
+) -> None:
+    """Of 300 px, depth is completed at a third. The plane is z = 5 + x / 2."""
+    view = replace(photo(size=size), image=torch.full((size, size, 3), 0.5))
+    x = (torch.arange(size) + 0.5 - size / 2) / 100
+    depth = (5 / (1 - x / 2)).repeat(size, 1)
+    in_hole = torch.arange(size) // 9 % 3 == 1
+    depth[in_hole[:, None] & in_hole] = torch.nan
+    new = grid_points(torch.zeros(0, 3), [view], stride, maps=[depth_of(view, depth)])[0]
+    assert len(new) > 0
+    error = (new[:, 2] / (5 + new[:, 0] / 2) - 1).abs()
+    assert error.max() < 2e-3
+
+
 def test_a_new_point_has_the_colour_of_its_pixel_and_without_points_in_view_there_is_none(caplog):
     view = photo()
     cloud = densify(cloud_of(torch.randn(50, 3) * 0.2 + torch.tensor([0, 0, 5.0])), [view], 1)
