@@ -269,7 +269,7 @@ def test_photos_are_placed_however_the_camera_moves_and_zooms(
     steps, true = (
         np.linalg.norm(np.asarray(c) - c[0], axis=1) for c in ([i.projection_center() for i in images], centers)
     )
-    assert steps / steps[-1] == pytest.approx(true / true[-1], abs=0.02)
+    assert steps / steps[-1] == pytest.approx(true / true[-1], abs=0.01)
     assert (told in caplog.text) if told else not caplog.text
 
 
