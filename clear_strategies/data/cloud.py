@@ -98,12 +98,8 @@ class CloudSettings:
         if self.init == "ply" and not self.path:
             refuse("data.cloud.path", "init=ply needs a PLY file", self.path, "add data.cloud.path=…")
         if self.depth is not None and self.init not in ("stereo", "auto"):
-            refuse(
-                "data.cloud.depth",
-                "completes stereo, of init=stereo and auto",
-                self.depth,
-                f"leave out init={self.init}",
-            )
+            rule = "completes stereo, of init=stereo and auto"
+            refuse("data.cloud.depth", rule, self.depth, f"leave out init={self.init}")
         require_choice("data.cloud.compare", self.compare, get_args(Compare))
         require_choice("data.cloud.densify", self.densify, (True, False, "auto"))
         for name in ("min_views", "enough", "stride", "random_points", "max_points"):

@@ -9,7 +9,7 @@ import io
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -19,9 +19,9 @@ from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.capture import Frame
-from clear_strategies.data.file_names import named, some
+from clear_strategies.data.file_names import some
 from clear_strategies.data.lenses import Lens
-from clear_strategies.data.view_names import bare
+from clear_strategies.data.view_names import ViewFiles
 from clear_strategies.errors import DataError
 from clear_strategies.files import read_bytes
 from clear_strategies.geometry.photos import is_background
@@ -54,10 +54,8 @@ class DepthFile:
     @staticmethod
     def of(path: Path, frame: Frame) -> DepthFile:
         c = frame.camera
-        if frame.lens is None:
-            lens = Lens(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
-            return DepthFile(path, lens, lens, c)
-        return DepthFile(path, frame.lens, frame.lens.resized(c.width, c.height, path).undistorted(path), c)
+        lens = frame.lens or Lens(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
+        return DepthFile(path, lens, lens.resized(c.width, c.height, path).undistorted(path), c)
 
     def at(self, camera: Camera) -> Float[Tensor, "h w"]:
         """Read the depth at the pixels of `camera`, that of the resized and cropped photo; nan where unknown.
@@ -75,26 +73,10 @@ class DepthFile:
 
 
 def depth_files(folder: Path, frames: Sequence[Frame]) -> list[DepthFile]:
-    """Find the depth file of each frame: below `folder`, it has the photo's path, or its name alone, with another suffix.
-
-    Raises:
-        DataError: there is no such folder, or a photo has no file, several, or one that it shares.
-    """
-    if not folder.is_dir():
-        raise DataError(folder, "data.cloud.depth", "is no folder", "check the path")
-    found = dict[Path, Frame]()
-    for frame in frames:
-        stem = bare(frame.name)
-        stems = dict.fromkeys((stem, frame.name, PurePosixPath(stem).name))
-        paths = [path for s in stems for suffix in SUFFIXES if (path := named(folder, s + suffix)).is_file()]
-        if len(paths) != 1:
-            problem = f"has {' and '.join(path.name for path in paths) or 'no depth'} for {frame.name}"
-            remedy = f"put one file per photo there, with the photo's name and one of {', '.join(SUFFIXES)}"
-            raise DataError(folder, "data.cloud.depth", problem, remedy)
-        if (other := found.setdefault(paths[0], frame)) is not frame:
-            problem = f"is the depth of {other.name} and of {frame.name}"
-            raise DataError(paths[0], "name", problem, "use the subfolders of the photos")
-    return [DepthFile.of(path, frame) for path, frame in found.items()]
+    """Find the depth file of each frame by `ViewFiles`, whose errors it raises."""
+    remedy = "give each training photo a depth file of its name, see data.cloud.depth"
+    files = ViewFiles(folder, "depth file", remedy, "", suffixes=SUFFIXES)
+    return [DepthFile.of(files.find(frame.name), frame) for frame in frames]
 
 
 def completed_by_files(

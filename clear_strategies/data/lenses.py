@@ -109,13 +109,11 @@ class Lens:
         return torch.from_numpy(result).clamp(0, 1)
 
     def sampled(self, values: Float[np.ndarray, "H W"], pinhole: Lens) -> Float[np.ndarray, "h w"]:
-        """The nearest of the values at each pixel of `pinhole`, a lens of any size and cut, float32; nan beyond the edges."""
+        """The nearest of the values at each pixel of `pinhole`, which may have another size, float32."""
         import cv2
 
         x, y = _sampling_maps(self, pinhole)
-        return cv2.remap(
-            values.astype(np.float32), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=math.nan
-        )
+        return cv2.remap(values.astype(np.float32), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
 
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         """K in OpenCV's convention: the first pixel is centred at (0, 0)."""

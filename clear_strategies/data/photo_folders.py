@@ -69,15 +69,15 @@ def folder_note(folder: Path) -> str:
     return f"{folder.name} (there are also {', '.join(others)})" if others else folder.name
 
 
-def list_images(folder: Path) -> list[Path]:
+def list_images(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> list[Path]:
     """List the image files of a folder, by their suffix, in order of names, without hidden files. If there is none, the DataError
     names what the folder contains instead.
     """
     if not folder.is_dir():
         raise DataError(folder, "folder", "is a file" if folder.exists() else "is not there", "check the path")
-    if images := images_in(folder):
+    if images := images_in(folder, suffixes=suffixes):
         return images
-    problem, remedy = f"holds no image ({', '.join(SUFFIXES)})", "check the path"
+    problem, remedy = f"holds no image ({', '.join(suffixes)})", "check the path"
     if inside := folders_of_images(folder):
         problem = f"{problem}, but {photo_counts(folder, inside)}"
         remedy = "give one of these folders, or put all photos of the scene into one"
@@ -112,9 +112,9 @@ def in_place_of_photos(paths: Iterable[Path]) -> tuple[str, str] | None:
     return f"{kind} ({len(found)}): {some([path.name for path in found])}", remedy
 
 
-def images_in(folder: Path, pattern: str = "*") -> list[Path]:
+def images_in(folder: Path, pattern: str = "*", suffixes: Sequence[str] = SUFFIXES) -> list[Path]:
     """List images as `list_images` does, possibly none; the pattern "**/*" includes the folders below."""
-    images = sorted(p for p in folder.glob(pattern) if p.suffix.lower() in SUFFIXES and p.is_file())
+    images = sorted(p for p in folder.glob(pattern) if p.suffix.lower() in suffixes and p.is_file())
     return [p for p in images if not any(part.startswith(".") for part in p.relative_to(folder).parts)]
 
 

@@ -68,28 +68,37 @@ def write_pngs(folder: Path, images: Iterable[tuple[str, Float[Tensor, "h w 3"]]
 
 @dataclass(frozen=True, slots=True)
 class ViewFiles:
-    """A folder with one image per view, see `clear_strategies.data.priors.Images`."""
+    """A folder with one image, or one file of other `suffixes`, per view, see `clear_strategies.data.priors.Images`."""
 
     folder: Path
     what: str  # a noun for one of the images, for messages
     remedy: str  # for a missing file
     resize: str  # the remedy for one of another size
     suffix: str = ""  # of the files' stems
+    suffixes: Sequence[str] = SUFFIXES
     _view_of: dict[Path, str] = field(default_factory=dict, init=False)
     _listed: dict[Path, dict[str, list[Path]]] = field(default_factory=dict, init=False)
 
     def file(self, name: str, width: int, height: int) -> Path:
-        """Find the image of the view; a DataError if there is none or several, it has another size or is that of another view."""
+        """Find the image of the view, as `find` does; a DataError if it has another size."""
+        path = self.find(name)
+        if (size := read_header(path).size(None)) != (width, height):
+            problem = f"is {size[0]}x{size[1]} where {width}x{height} is expected"
+            raise DataError(path, "size", problem, self.resize)
+        return path
+
+    def find(self, name: str) -> Path:
+        """Find the file of the view; a DataError if there is none or several, or it is that of another view."""
         folder, _, stem = bare(name := normalized(name)).rpartition("/")
         below, whole = named(self.folder, folder), _file_name(name) + self.suffix
         inside, file_stem = below if below.is_dir() else self.folder, stem + self.suffix
         if self._listed.get(inside, {}).keys().isdisjoint((file_stem, whole)):
             self._listed[inside] = {}
-            for path in list_images(inside):
+            for path in list_images(inside, self.suffixes):
                 self._listed[inside].setdefault(normalized(path.stem), []).append(path)
         files = self._listed[inside].get(whole) or self._listed[inside].get(file_stem, [])
         if len(files) != 1:
-            problem, remedy = f"has no {self.what} {file_stem} ({', '.join(SUFFIXES)})", self.remedy
+            problem, remedy = f"has no {self.what} {file_stem} ({', '.join(self.suffixes)})", self.remedy
             if files:
                 problem, remedy = f"has {' and '.join(file.name for file in files)} for one view", "keep one of them"
             raise DataError(inside, stem, problem, remedy)
@@ -97,9 +106,6 @@ class ViewFiles:
             problem = f"would be that of two views, {other} and {name}"
             remedy = f"put the {self.what}s into subfolders like those of the photos"
             raise DataError(files[0], self.what, problem, remedy)
-        if (size := read_header(files[0]).size(None)) != (width, height):
-            problem = f"is {size[0]}x{size[1]} where {width}x{height} is expected"
-            raise DataError(files[0], "size", problem, self.resize)
         return files[0]
 
 
