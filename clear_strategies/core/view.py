@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
@@ -72,8 +72,9 @@ class Photo:
         return replace(self, image=image, transparency=None)
 
     def factor_to(self, max_pixels: int) -> int:
-        """The smallest whole factor that reduces it to at most `max_pixels`."""
-        return max(1, math.ceil(math.sqrt(self.camera.width * self.camera.height / max_pixels)))
+        """The smallest whole factor by which `reduced` gives at most `max_pixels`."""
+        width, height = self.camera.width, self.camera.height
+        return next(k for k in itertools.count(1) if (width // k) * (height // k) <= max_pixels)
 
     def cropped(self, multiple: int) -> Photo:
         """Without rows at the bottom and columns at the right, so that `multiple` divides both sizes."""

@@ -1,5 +1,7 @@
 """Operators on images, photos before another background, and reduced depth maps."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -56,7 +58,16 @@ def test_agreement_is_four_fifths_at_the_median_difference_and_a_half_at_twice_t
     )  # of which all 5 x 5 pixels differ so
 
 
-# ---- photos before another background; the depth map of a photo at a smaller size
+# ---- photos before another background; a photo and its depth map at a smaller size
+def test_a_photo_is_reduced_by_the_smallest_factor_that_suffices():
+    photo = Photo(replace(toy.camera(0.0), width=5, height=7), torch.zeros(7, 5, 3))
+    for most in range(1, 40):
+        factor = photo.factor_to(most)
+        width, height = photo.reduced(factor).image.shape[:2]
+        assert width * height <= most
+        assert factor == 1 or (5 // (factor - 1)) * (7 // (factor - 1)) > most
+
+
 def test_a_reduced_depth_map_holds_medians_of_what_is_known_and_a_completed_one_changes_nothing_known():
     depth = torch.full((4, 6), torch.nan)
     confidence = torch.zeros(4, 6)

@@ -48,9 +48,7 @@ class Grey:
 
 def grey(photo: Photo, enlarge: int, max_pixels: int) -> Grey:
     """The grey image of a photo, enlarged by `enlarge` if it is small, or reduced to at most `max_pixels`."""
-    camera, reduce = photo.camera, 1
-    while (camera.width // reduce) * (camera.height // reduce) > max_pixels:
-        reduce += 1
+    reduce = photo.factor_to(max_pixels)
     whole = photo.cropped(reduce)
     image, camera = images.downsample(whole.image, reduce, "area"), whole.camera.scaled(1 / reduce)
     if reduce == 1 and enlarge > 1 and camera.width * camera.height * enlarge**2 <= min(_ENLARGED, max_pixels):
