@@ -39,7 +39,7 @@ def scene_notes(
     network = network_of(prior) if sr else None
     unused = len(capture.frames) - len(train) - len(test)
     none = f"none{'' if unused else ': all are trained on'} (data.views.test_every=8 keeps every 8th for testing)"
-    return {
+    notes = {
         "scene": f"{capture.name}, {counted(len(capture.frames), 'photo')}",
         **capture.notes,
         "train views": _names(train) + (f"; not used: {counted(unused, 'photo')} (data.views)" if unused else ""),
@@ -47,18 +47,15 @@ def scene_notes(
         "sizes": f"photos of {size_of(photo)}, shrink {views.shrink}, {views.sizes} to whole pixels at both scales",
         "LR": f"{size_of(sample.lr.camera)}{others}, {_lr_source(views)}",
         "HR": f"{size_of(sample.hr.camera)}{others} (x{views.sr_scale}), {'SR images: ' if sr else ''}{sample.sr_source}",
-        **_masks(train),
+        "masks": _masks(train),
         **exposure,
-        **_back_projection(train, views.downsample),
-        **({} if network is None else {"SR network": f"{fingerprint(network)} (SHA-256)"}),
-        **(
-            {"the SR images add": f"{_added_detail(train):.1f} grey levels to bicubic interpolation, on average"}
-            if sr
-            else {}
-        ),
+        "back-projection": _back_projection(train, views.downsample),
+        "SR network": None if network is None else f"{fingerprint(network)} (SHA-256)",
+        "the SR images add": _added_detail(train) if sr else None,
         "initial points": f"{len(points):,}: {points.source}",
         "points use test views": points.uses_test_views,
     }
+    return {label: fact for label, fact in notes.items() if fact is not None}
 
 
 def size_of(camera: Camera) -> str:
@@ -79,22 +76,21 @@ def _lr_source(views: ViewSettings) -> str:
     return f"{by}{views.downsample} of the {'HR photo' if views.photos_are == 'hr' else 'photos'}"
 
 
-def _masks(views: Sequence[View]) -> dict[str, str]:
+def _masks(views: Sequence[View]) -> str | None:
     if not (hidden := [float((~view.lr.shown).float().mean()) for view in views if view.lr.shown is not None]):
-        return {}
+        return None
     mean = sum(hidden) / len(hidden)
-    return {"masks": f"{len(hidden)} of {len(views)} training photos have one, which hides {mean:.1%} of it"}
+    return f"{len(hidden)} of {len(views)} training photos have one, which hides {mean:.1%} of it"
 
 
-def _back_projection(views: Sequence[View], down: DownKernel) -> dict[str, str]:
+def _back_projection(views: Sequence[View], down: DownKernel) -> str | None:
     if not (before := [view.disagreement for view in views if view.disagreement is not None]):
-        return {}
+        return None
     after = ((images.downsample(view.hr.image, view.factor, down) - view.lr.image).abs() for view in views)
-    text = f"SR images differed from the LR photos by {_grey_levels(before):.2f} grey levels, now by {_grey_levels(after):.2f}"
-    return {"back-projection": text}
+    return f"SR images differed from the LR photos by {_grey_levels(before):.2f} grey levels, now by {_grey_levels(after):.2f}"
 
 
-def _added_detail(views: Sequence[View]) -> float:
+def _added_detail(views: Sequence[View]) -> str:
     """Mean |I_HR - U(I_LR)| in grey levels of 255. Logs a warning if there is no detail."""
     added = _grey_levels((v.hr.image - images.upsample(v.lr.image, v.factor)).abs() for v in views)
     if added < _ROUNDING:
@@ -102,7 +98,7 @@ def _added_detail(views: Sequence[View]) -> float:
             "the SR images differ from bicubic interpolation by %.2f grey levels only. They hold hardly any detail, so the "
             "strategies can add none.", added,
         )  # fmt: skip
-    return added
+    return f"{added:.1f} grey levels to bicubic interpolation, on average"
 
 
 def _grey_levels(differences: Iterable[Tensor]) -> float:
