@@ -173,10 +173,8 @@ def _summary(single: pd.DataFrame, against: str | None) -> pd.DataFrame:
     """A row for each method of one scene."""
     groups = single.groupby("key", sort=False)
     table = groups[["scene", "method", "run"]].first().assign(average=False, runs=groups.size())
-    for _, of_method in groups:
-        row = f"{of_method['scene'].iloc[0]}, {of_method['method'].iloc[0]}"
-        if of_method["psnr"].isna().any():
-            _log.warning("%s: runs without a finite PSNR are left out of its mean.", row)
+    for row in table[groups["psnr"].count() < table["runs"]].itertuples():
+        _log.warning("%s, %s: runs without a finite PSNR are left out of its mean.", row.scene, row.method)
     table["seeds"] = groups["seed"].agg(lambda seeds: ", ".join(map(str, sorted(set(seeds)))))
     for quantity in _quantities(single):
         table[quantity], table[f"{quantity}_std"] = groups[quantity].mean(), groups[quantity].std()
