@@ -103,20 +103,15 @@ class ReadyRasterizer:
         given = self.make.keywords
         return RasterSettings(**{f.name: given[f.name] for f in fields(RasterSettings) if f.name in given})
 
-    def having(self, **settings: Any) -> ReadyRasterizer:
-        """Return the rasterizer with other settings."""
-        make = functools.partial(self.make, **settings)
+    def of_scene(self, background: Color, means: Float[Tensor, "N 3"]) -> ReadyRasterizer:
+        """Return the rasterizer for a scene of these points: over its background, unless the settings name one; if the points'
+        `spread` is below 1, it scales a default near plane.
+        """
+        own: dict[str, Any] = {"background": background, **self.make.keywords}
+        if own.get("near") == _SHARED.near and len(means) and 0 < (size := spread(means)) < 1:
+            own["near"] = _SHARED.near * size
+        make = functools.partial(self.make, **own)
         return replace(self, rasterizer=make(), make=make)
-
-    def over(self, background: Color) -> ReadyRasterizer:
-        """Return the rasterizer with the data set's background, unless the settings name one."""
-        return self if "background" in self.make.keywords else self.having(background=background)
-
-    def among(self, means: Float[Tensor, "N 3"]) -> ReadyRasterizer:
-        """Return the rasterizer for a scene of these points: if their `spread` is below 1, it scales a default near plane."""
-        if self.make.keywords.get("near") != _SHARED.near or not len(means) or not 0 < (size := spread(means)) < 1:
-            return self
-        return self.having(near=_SHARED.near * size)
 
 
 def load_rasterizer(

@@ -120,7 +120,7 @@ class _Job:
         scene = load()
         _warn_if_few_placed(scene.notes)
         device.log_choice(settings.rasterizer, self.ready)
-        ready = self.ready.over(scene.background).among(scene.cloud.means)
+        ready = self.ready.of_scene(scene.background, scene.cloud.means)
         there = scene.to(ready.device)
         state = self._start(there, ready)
         if found is not None:

@@ -109,7 +109,7 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
         name = folder.name if ply.name == PLY else ply.stem
     cameras = _cameras_near(folder, above)
     background = cameras[0].background if cameras else (0.0, 0.0, 0.0)
-    ready = _load_rasterizer(settings, rasterizer).over(background).among(field.means.data)
+    ready = _load_rasterizer(settings, rasterizer).of_scene(background, field.means.data)
     painter = Painter(field.to(ready.device), ready.make)
     source += f", {counted(len(field), 'Gaussian')}"
     return SavedSplat(folder, name or "splat", source, painter, cameras, bool(settings.get("antialiased", True)))

@@ -66,14 +66,14 @@ def test_the_method_says_whether_opacities_are_compensated(chosen: tuple[str, ..
 def test_a_rasterizer_of_another_package_is_a_target_with_the_same_settings():
     target = f"rasterizer._target_={__name__}.Theirs"
     found = settings(target, "rasterizer.kernel=0.3", "rasterizer.near=1e-5", "+rasterizer.sharpness=2").rasterizer
-    ready = device.load_rasterizer(found, None).over((1.0, 1.0, 1.0))
+    white, nothing = (1.0, 1.0, 1.0), torch.zeros(0, 3)
+    ready = device.load_rasterizer(found, None).of_scene(white, nothing)
     assert (type(ready.rasterizer), ready.name) == (Theirs, "Theirs")
     assert (ready.rules.kernel, ready.rules.near) == (0.3, 1e-5)
-    assert (ready.rasterizer.sharpness, ready.rasterizer.background) == (2, (1.0, 1.0, 1.0))
-    assert ready.make().background == (1.0, 1.0, 1.0)
-    own = device.load_rasterizer(settings(target, "rasterizer.background=[0,0,1]").rasterizer, None).over(
-        (1.0, 1.0, 1.0)
-    )
+    assert (ready.rasterizer.sharpness, ready.rasterizer.background) == (2, white)
+    assert ready.make().background == white
+    blue = settings(target, "rasterizer.background=[0,0,1]").rasterizer
+    own = device.load_rasterizer(blue, None).of_scene(white, nothing)
     assert own.rasterizer.background == (0, 0, 1)
     with pytest.raises(SettingError, match=r"rasterizer.sharp: .* Did you mean rasterizer.sharpness\?"):
         settings(target, "+rasterizer.sharp=2")
