@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import logging
 import time
-from typing import Final
+from collections.abc import Iterable, Iterator
+from typing import Final, TypeVar
+
+T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
 
@@ -31,6 +34,14 @@ class Progress:
             left = duration((now - self._began) * (self.total - done) / done)
             _log.info("%s: %d of %d %s, about %s left", self.what, done, self.total, self.unit, left)
             self._due, self._done = now + EVERY, done
+
+
+def told(items: Iterable[T], what: str, unit: str, total: int, first: float = FIRST) -> Iterator[T]:
+    """Yield the items, and log as `Progress` does how many have been used."""
+    progress = Progress(what, unit, total, first)
+    for done, item in enumerate(items, 1):
+        yield item
+        progress(done)
 
 
 def duration(seconds: float) -> str:

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import images
-from clear_strategies.core.progress import Progress
+from clear_strategies.core.progress import told
 from clear_strategies.core.view import SMALLEST, Photo, View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.capture import NO_PARALLAX, STEP_ASIDE, Capture, Frame
@@ -64,12 +64,11 @@ def prepare(
     require_source(cloud, capture.points)
     files = () if cloud.depth is None else depth_files(Path(cloud.depth), train_frames)
     _check_positions(capture, [frame.camera for frame in train_frames], cloud)
-    progress = Progress("photos and their SR images", "photos", len(frames))
     made, work_log = list[View](), WorkLog() if work_log is None else work_log
     with work_log.stage("photos and SR images"):
-        for name, photo, lr in _loaded(capture, views, frames, lr_files):
+        loaded = _loaded(capture, views, frames, lr_files)
+        for name, photo, lr in told(loaded, "photos and their SR images", "photos", len(frames)):
             made.append(_view(capture, views, prior, name, photo, lr, trains=len(made) < len(train_frames)))
-            progress(len(made))
     train, test = tuple(made[: len(train_frames)]), tuple(made[len(train_frames) :])
     require_shown(train)
     with work_log.stage("initial points"):

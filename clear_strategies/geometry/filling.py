@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.points import PointCloud
-from clear_strategies.core.progress import Progress
+from clear_strategies.core.progress import told
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.photos import each_photo, is_background
 from clear_strategies.geometry.projection import back_project, sample_colors, seen_pixels
@@ -85,13 +85,9 @@ def grid_points(
                 kept[inside] &= ~(depth < _NEARER * other.depth.cpu()[row, column].double())  # True where it is unknown
         return points[kept], shade[kept]
 
-    added, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
-    progress = Progress("depth where stereo finds none", "photos", len(photos))
-    for points, shades in each_photo(points_in, photos):
-        added.append(points)
-        colors.append(shades)
-        progress(len(added) - 1)
-    return torch.cat(added), torch.cat(colors)
+    added = told(each_photo(points_in, photos), "depth where stereo finds none", "photos", len(photos))
+    points, colors = map(torch.cat, zip((torch.zeros(0, 3), torch.zeros(0, 3)), *added, strict=True))
+    return points, colors
 
 
 def _pixels_to_fill(

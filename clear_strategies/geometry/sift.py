@@ -20,7 +20,7 @@ from torch import Tensor
 from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.images import to_bytes
 from clear_strategies.core.points import PointCloud
-from clear_strategies.core.progress import Progress
+from clear_strategies.core.progress import told
 from clear_strategies.core.view import Photo
 from clear_strategies.geometry.cameras import partners
 from clear_strategies.geometry.optional import REMEDY, missing
@@ -100,9 +100,7 @@ def triangulate(photos: Sequence[Photo], settings: TriangulationSettings | None 
     per_pair = [Pairs(torch.zeros(0, 3).double(), torch.zeros(0, 2, dtype=torch.long), torch.zeros(0).double())]
     compared = enumerate(partners([photo.camera for photo in photos]))
     pairs_of_views = sorted({(min(i, j), max(i, j)) for i, others in compared for j in others})
-    progress = Progress("features that photos have in common", "pairs", len(pairs_of_views))
-    for done, (i, j) in enumerate(pairs_of_views):
-        progress(done)
+    for i, j in told(pairs_of_views, "features that photos have in common", "pairs", len(pairs_of_views)):
         index = match(features[i], features[j], settings.ratio)
         x, y = features[i].pixels[index[:, 0]], features[j].pixels[index[:, 1]]
         points, angles, good = triangulate_pair(photos[i].camera, photos[j].camera, x, y, settings)

@@ -28,7 +28,7 @@ from clear_strategies import files
 from clear_strategies.core import images
 from clear_strategies.core.evidence import PatchMaps
 from clear_strategies.core.gradients import Grads
-from clear_strategies.core.progress import Progress
+from clear_strategies.core.progress import told
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
@@ -85,14 +85,12 @@ def write_maps(
         The renders of these views by their names, for reuse.
     """
     means, renders = dict[str, Mapping[str, float]](), dict[str, Tensor]()
-    done = Progress("maps", "views", len(views))
-    for view in views:
+    for view in told(views, "maps", "views", len(views)):
         view_folder, of_view = folder / stems[view.name], view_maps(painter, conductor, view, t)
         means[view.name], renders[view.name] = of_view.means, of_view.render
         for name, values in of_view.maps.items():
             beside(write_png, view_folder / f"{name}.png", values)
         beside(_write_picture, view_folder / "maps.jpg", view, of_view)
-        done(len(means))
     corrector = conductor.owner("reconcile")
     if corrector is None:
         _log.debug("maps: no strategy of this run corrects, so there is no corrected.png.")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -16,7 +15,7 @@ from torch import Tensor
 from clear_strategies import files
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
-from clear_strategies.core.progress import Progress
+from clear_strategies.core.progress import told
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import GaussianPly, write_gaussians
@@ -34,7 +33,7 @@ from clear_strategies.training import memory
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.state import TrainState
 from clear_strategies.viewing import cameras
-from clear_strategies.viewing.look import Painter, Pixels, write_video
+from clear_strategies.viewing.look import Painter, write_video
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
 from rasterizers.native import kernel_threads, threads
@@ -174,14 +173,9 @@ def _write_video(path: Path, train: Sequence[Camera], painter: Painter, frames: 
     """Write a loop through the training cameras. Without imageio-ffmpeg, log a message instead."""
     if not frames:
         return
-    done = Progress("video", "frames", frames)
-
-    def draw(number: int, camera: Camera) -> Pixels:
-        done(number)
-        return images.to_bytes(painter.color(cameras.at_most(camera, _LONGEST)))
-
+    along = told(cameras.through(train, frames), "video", "frames", frames)
     try:
-        write_video(path, itertools.starmap(draw, enumerate(cameras.through(train, frames))))
+        write_video(path, (images.to_bytes(painter.color(cameras.at_most(camera, _LONGEST))) for camera in along))
     except SettingError as missing:
         _log.info("no video of the camera path is written: %s", missing)
 

@@ -12,7 +12,7 @@ import torch
 
 from clear_strategies import Conductor
 from clear_strategies.core import progress
-from clear_strategies.core.progress import EVERY, FIRST, Progress
+from clear_strategies.core.progress import EVERY, FIRST, Progress, told
 from clear_strategies.core.work_log import WorkLog
 
 
@@ -138,3 +138,14 @@ def test_a_line_now_and_then_and_only_where_something_has_happened(monkeypatch, 
             counter(done)
     left = {2: "8 s", 3: "40 s", 4: "42 s", 5: "1 min 38 s"}
     assert caplog.messages == [f"features: {n} of 10 photos, about {time} left" for n, time in left.items()]
+
+
+def test_items_that_have_been_used_are_told(monkeypatch, caplog):
+    clock, used = [100.0], []
+    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
+    with caplog.at_level(logging.INFO):
+        for item in told(iter("abc"), "maps", "views", 3):
+            used.append(item)
+            clock[0] += EVERY
+    assert used == ["a", "b", "c"]
+    assert caplog.messages == ["maps: 1 of 3 views, about 20 s left", "maps: 2 of 3 views, about 10 s left"]

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.checks import require_whole
-from clear_strategies.core.progress import Progress
+from clear_strategies.core.progress import told
 from clear_strategies.errors import SettingError
 
 _LONG: Final = 30.0  # seconds; less is told by the number of photos that are done
@@ -38,15 +38,14 @@ def tiled(
     rows, columns = (_shares(size, tile, overlap) for size in (height, width))
     out = lr.new_zeros(height * factor, width * factor, 3)
     weight = lr.new_zeros(height * factor, width * factor, 1)
-    progress = Progress("super-resolution of a photo", "tiles", len(rows) * len(columns), _LONG)
-    for done, (row, column) in enumerate((r, c) for r in rows for c in columns):
+    shares = list(itertools.product(rows, columns))
+    for row, column in told(shares, "super-resolution of a photo", "tiles", len(shares), _LONG):
         (rows_in, rows_out, fade_y), (columns_in, columns_out, fade_x) = (
             _along(share, size, factor, overlap) for share, size in ((row, height), (column, width))
         )
         fade = (fade_y[:, None] * fade_x)[..., None].to(lr)
         out[rows_out, columns_out] += fade * upscale(lr[rows_in, columns_in])
         weight[rows_out, columns_out] += fade
-        progress(done + 1)
     return out / weight
 
 

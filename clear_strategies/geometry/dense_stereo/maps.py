@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core.progress import Progress
+from clear_strategies.core.progress import told
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.dense_stereo.consistency import Estimate, confirm, speckles
 from clear_strategies.geometry.dense_stereo.cost import Grey, cost_volume, grey
@@ -88,12 +88,7 @@ def _estimates(
         _log.debug("stereo: photo %d against %s.", i, comparison.others[: settings.sources])
         return _on_photo(plane_sweep(greys[i], others, comparison, settings), photos[i])
 
-    estimates: list[Estimate | None] = []
-    progress = Progress("depth by stereo", "photos", len(photos))
-    for found in each_photo(estimate, photos):
-        estimates.append(found)
-        progress(len(estimates))
-    return estimates
+    return list(told(each_photo(estimate, photos), "depth by stereo", "photos", len(photos)))
 
 
 def plane_sweep(image: Grey, others: list[Grey], comparison: Comparison, settings: StereoSettings) -> Estimate:
