@@ -30,8 +30,6 @@ from clear_strategies.geometry.photos import blackened, cut_out
 from clear_strategies.geometry.sift import TriangulationSettings, triangulate
 from rasterizers.interface import Color
 
-__all__ = ["CloudSettings", "InitialPoints", "initial_points", "require_source"]
-
 _log = logging.getLogger(__name__)
 
 _FEW_PHOTOS: Final = 5

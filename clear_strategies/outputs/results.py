@@ -128,12 +128,11 @@ def export_ply(path: Path, field: GaussianField, *, antialiased: bool = True, de
     """
     splats = field.baked()
     tiny = torch.finfo(torch.float32).eps
-    offset = splats.rgb_offset if splats.rgb_offset is not None else torch.zeros_like(splats.means)
     higher = torch.zeros_like(field.shN.data)
     higher[:, : splats.shN.shape[1]] = splats.shN  # bands above the active degree were never rendered
     gaussians = GaussianPly(
         means=splats.means,
-        sh0=splats.sh0 + offset[:, None] / SH_C0,
+        sh0=splats.sh0 + field.detail.data[:, None] / SH_C0,
         shN=higher[:, : (degree + 1) ** 2 - 1],
         opacities=torch.logit(splats.opacities.clamp(tiny, 1 - tiny)),
         scales=splats.scales.log(),

@@ -23,8 +23,6 @@ from rasterizers.interface import Camera, Rasterizer
 
 _SOLID: Final = 0.5  # alpha of a pixel from which it has a depth
 _EXTREMES: Final = (0.02, 0.98)  # quantiles of depth at the ends of the range
-DEPTH_COLORS: Final = "viridis_r"
-"""matplotlib's name of the colours of depth: near is bright."""
 _UNKNOWN: Final = "#cccccc"
 FPS: Final = 24.0  # along a path
 _QUALITY: Final = "20"  # x264's CRF: 18 cannot be told from the frames, 23 is its default
@@ -79,10 +77,10 @@ def depth_range(depth: Float[Tensor, "*shape"]) -> tuple[float, float]:
 
 
 def colored(depth: Float[Tensor, "H W"], near: float, far: float) -> UInt8[np.ndarray, "H W 3"]:
-    """Map depth to colours; grey where it is not finite."""
+    """Map depth to colours: near is bright, and grey where it is not finite."""
     from matplotlib import colormaps
 
-    colors = colormaps[DEPTH_COLORS].with_extremes(bad=_UNKNOWN)
+    colors = colormaps["viridis_r"].with_extremes(bad=_UNKNOWN)
     return np.asarray(colors(((depth - near) / (far - near)).numpy(), bytes=True)[..., :3])
 
 
