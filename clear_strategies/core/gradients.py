@@ -66,7 +66,13 @@ class Grads(dict[str, Tensor]):
         """The sum with another, each of whose rows counts `weight` times."""
         total = Grads(self)
         for name, value in other.items():
-            total[name] = _plus_rows(total[name], value, weight) if name in total else scale_rows(value, weight)
+            rows = weight.to(value).view(-1, *[1] * (value.dim() - 1)) if isinstance(weight, Tensor) else weight
+            if name not in total:
+                total[name] = value * rows
+            elif isinstance(rows, Tensor):
+                total[name] = torch.addcmul(total[name], value, rows)
+            else:
+                total[name] = torch.add(total[name], value, alpha=rows)
         return total
 
     def __mul__(self, weight: float | Float[Tensor, " N"]) -> Grads:
@@ -120,8 +126,9 @@ def summed(each: Sequence[Grads], weight: Float[Tensor, " N"]) -> list[Grads]:
     *others, base, hf = each
     total = base.without_detail().plus(hf.without_detail(), weight)  # Eq. 13
     total.screen = base.screen
-    detail = {"detail": scale_rows(hf["detail"], weight)} if "detail" in hf else {}
-    return [*others, total, Grads(detail, screen=hf.screen)]
+    detail = Grads({name: g for name, g in hf.items() if name == "detail"}) * weight
+    detail.screen = hf.screen
+    return [*others, total, detail]
 
 
 @runtime_checkable
@@ -149,26 +156,10 @@ class Shot(Protocol):
         ...
 
 
-def _plus_rows(
-    a: Float[Tensor, "N ..."], b: Float[Tensor, "N ..."], weight: float | Float[Tensor, " N"]
-) -> Float[Tensor, "N ..."]:
-    """A + weight · b, row by row."""
-    if not isinstance(weight, Tensor):
-        return torch.add(a, b, alpha=weight)
-    return torch.addcmul(a, b, weight.to(b).view(-1, *[1] * (b.dim() - 1)))
-
-
 def in_our_shapes(tensors: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
     """The same tensors by attribute, with opacities as [N], which 3DGS and nerfstudio keep as [N, 1]."""
     o = tensors.get("opacities")
     return tensors if o is None or o.shape[1:] != (1,) else Grads({**tensors, "opacities": o[:, 0]})
-
-
-def scale_rows(value: Float[Tensor, "N ..."], weight: float | Float[Tensor, " N"]) -> Float[Tensor, "N ..."]:
-    """Each row times its weight."""
-    if isinstance(weight, Tensor):
-        weight = weight.to(value).view(-1, *[1] * (value.dim() - 1))
-    return value * weight
 
 
 def gathered(rows: Float[Tensor, "N ..."], parents: Int[Tensor, " M"]) -> Float[Tensor, "M ..."]:
