@@ -56,23 +56,22 @@ class Drawable:
     """A rendering that a host asks for, as the arguments of a rasterizer of this package.
 
     Args:
-        inputs: means, quats, scales, opacities and colors [N, K, 3], in the host's graph.
-        bands: the number of active bands of the colours. offset: f_det, at HR.
+        inputs: in the host's graph; with f_det at HR.
+        bands: the number of active bands of the colours.
         background: behind the picture.
         params: raw parameters by gsplat's names.
     """
 
     rasterizer: Rasterizer
     camera: Camera
-    inputs: Mapping[str, Tensor]
+    inputs: Inputs
     bands: int
-    offset: Float[Tensor, "N 3"] | None
     background: Float[Tensor, "1 3"]
     params: Mapping[str, Tensor]
 
     def compared_with(self, photo: Photo, **more: Any) -> _RenderInputs:
         """What is drawn, without its graph, and the photo that it is compared with."""
-        drawn = Inputs(**self.inputs, rgb_offset=self.offset).drawn(self.bands)
+        drawn = self.inputs.drawn(self.bands)
         return _RenderInputs(*drawn, self.background, self.camera, photo.image, photo.shown, **more)
 
 
@@ -87,7 +86,7 @@ class _RenderInputs(NamedTuple):
     """All tensors that the work on one picture reads.
 
     Args:
-        means, quats, scales, opacities, colors, rgb_offset: see `Drawable`.
+        means, quats, scales, opacities, colors, rgb_offset: see `Inputs`.
         image, shown: of the photo that the picture is compared with.
         looked_up: see `Step.looked_up`; None for an extra view.
         weight: of the pixels of an extra view; None at HR.
@@ -121,8 +120,7 @@ class _RenderInputs(NamedTuple):
             rasterizer = over(rasterizer, (red, green, blue))
         drawn = Inputs(self.means, self.quats, self.scales, self.opacities, self.colors, self.rgb_offset)
         r = rasterizer(drawn.splats(), self.camera)
-        inputs = Inputs(**asked.inputs, rgb_offset=asked.offset)
-        drawing = Drawing(r, rasterizer, asked.camera, inputs, asked.bands)
+        drawing = Drawing(r, rasterizer, asked.camera, asked.inputs, asked.bands)
         image = r.image if self.mask is None else r.image * self.mask
         return AutogradShot(image, r.means2d, r.visible, asked.params, drawings=(drawing,), mask=self.mask)
 
@@ -182,7 +180,7 @@ class HrDrawing:
             hr = conductor.hr_gradients(shot, step, AutogradShot.gradients, apart=apart)
         if conductor.objective.lambda_hr(step.t) == 0:
             return hr, []
-        edges, shared = (drawn.inputs, ()) if isinstance(drawn, Drawable) else (drawn.edges, drawn.shared)
+        edges, shared = (drawn.inputs.attributes(), ()) if isinstance(drawn, Drawable) else (drawn.edges, drawn.shared)
         return side_of_leaves(hr, edges, drawn.params, self._loss_scale(), shared)
 
     def extra_view(self, extra: ExtraView, view: View, t: int, render_at: RenderAt) -> Grads:
@@ -240,7 +238,7 @@ class HrDrawing:
 
         inputs = asked.compared_with(photo, weight=extra.weight)
         g, _ = self._done(asked, inputs, t, ("extra", extra.robust), work)
-        found = every_number(to_leaves(g, asked.inputs, asked.params)[0], asked.params)
+        found = every_number(to_leaves(g, asked.inputs.attributes(), asked.params)[0], asked.params)
         return Grads({name: x.clone() for name, x in found.items()})  # the next replay overwrites some of them
 
     def _done(self, asked: Drawable, inputs: _RenderInputs, t: int, constants: tuple[Any, ...], work: _Work) -> _Made:

@@ -23,6 +23,7 @@ from integration.views import SAME_POSE, require_intrinsics
 from rasterizers.as_gsplat import cameras_of
 from rasterizers.differentiable import collected_drawings
 from rasterizers.geometry import SH_C0
+from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer
 from rasterizers.torch_internals import base_of
 
@@ -196,9 +197,9 @@ def drawable(rasterizer: Rasterizer, call: Call, params: Mapping[str, Tensor], c
         (camera,) = cameras_of(viewmats, Ks, call["width"], call["height"])
     behind = call.get("backgrounds")
     background = call["means"].new_zeros(1, 3) if behind is None else behind.detach().reshape(1, 3).float()
-    drawn = {name: call[name] for name in ("means", "quats", "scales", "opacities", "colors")}
-    drawn["colors"] = drawn["colors"].to(drawn["means"].dtype)  # float16 in some hosts
-    return Drawable(rasterizer, camera, drawn, (call["sh_degree"] + 1) ** 2, params.get("detail"), background, params)
+    colors = call["colors"].to(call["means"].dtype)  # float16 in some hosts
+    inputs = Inputs(call["means"], call["quats"], call["scales"], call["opacities"], colors, params.get("detail"))
+    return Drawable(rasterizer, camera, inputs, (call["sh_degree"] + 1) ** 2, background, params)
 
 
 def host_output(
