@@ -83,6 +83,11 @@ def spherical_harmonics(directions: Float[Tensor, "M 3"], bands: int) -> Float[T
     return torch.stack(basis, dim=-1)
 
 
+def basis_from(camera: Camera, means: Float[Tensor, "M 3"], bands: int) -> Float[Tensor, "M B1"]:
+    """Y of the directions in which a camera sees the Gaussians; `bands` as of `spherical_harmonics`."""
+    return spherical_harmonics(torch.nn.functional.normalize(means - camera.center.to(means), dim=-1), bands)
+
+
 def tangent_limits(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
     """The ranges (low, high) of x/z and of y/z to which the projection's Jacobian is clamped.
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rasterizers.backend import Backend, require_cotangents, require_finite_splats, require_splats
-from rasterizers.geometry import SH_C0, spherical_harmonics
+from rasterizers.geometry import SH_C0, basis_from
 from rasterizers.interface import BackendUnavailable, Camera, Rendering, SplatGradients, Splats, Traits
 
 _FIXED: Final = {"alpha_min": (1 / 255,), "alpha_max": (0.999, 0.99), "transmittance_min": (1e-4,)}
@@ -88,8 +88,7 @@ class GsplatRasterizer(Backend):
         radii = info["radii"][0]
         visible = (radii > 0).all(-1) if radii.dim() == 2 else radii > 0
         depths = images[0, ..., 3].detach() if depth else None
-        direction = torch.nn.functional.normalize(splats.means.detach() - camera.center.to(splats.means), dim=-1)
-        basis = spherical_harmonics(direction, splats.shN.shape[1])
+        basis = basis_from(camera, splats.means.detach(), splats.shN.shape[1])
         return GsplatRendering(
             colors[0].detach().contiguous(), alphas[0, ..., 0].detach(), depths,
             info["means2d"].detach()[0], visible,

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rasterizers.geometry import spherical_harmonics
+from rasterizers.geometry import basis_from
 from rasterizers.interface import Camera, SplatGradients, Splats
 
 
@@ -40,9 +40,7 @@ def _by_direction(splats: Splats, camera: Camera, g: SplatGradients) -> Float[Te
         return torch.zeros_like(splats.means)
     with torch.enable_grad():
         means = splats.means.detach().requires_grad_()
-        basis = spherical_harmonics(
-            torch.nn.functional.normalize(means - camera.center.to(means), dim=-1), splats.shN.shape[1]
-        )
+        basis = basis_from(camera, means, splats.shN.shape[1])
         rgb = (basis[:, 1:, None] * splats.shN.detach()).sum(1)
         (found,) = torch.autograd.grad(rgb, means, g.rgb[0])
     return found

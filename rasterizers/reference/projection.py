@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from rasterizers.geometry import BLACK, REACH, depths, rotation_matrix, spherical_harmonics, tangent_limits
+from rasterizers.geometry import BLACK, REACH, basis_from, depths, rotation_matrix, tangent_limits
 from rasterizers.interface import Camera, RasterSettings, SplatGradients, Splats
 
 # Columns of the table that blending reads, one row per projected Gaussian; the last one is there if depth is drawn.
@@ -162,9 +162,7 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings, *, depth: 
         if settings.antialiased:
             opacities = opacities * f.compensation
 
-        offset = means - camera.center.to(means)
-        direction = offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
-        basis = spherical_harmonics(direction, splats.shN.shape[1])
+        basis = basis_from(camera, means, splats.shN.shape[1])
         coefficients = torch.cat((splats.sh0.detach()[rows], splats.shN.detach()[rows]), dim=1)
         raw_rgb = (basis[:, :, None] * coefficients).sum(1) + 0.5
         if splats.rgb_offset is not None:
