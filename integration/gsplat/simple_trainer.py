@@ -98,10 +98,8 @@ def install(
         return result
 
     @functools.wraps(rasterize_splats)
-    def rasterize_the_view(runner: Any, *args: Any, image_ids: Tensor | None = None, **kwargs: Any) -> Any:
-        if image_ids is not None:
-            kwargs["image_ids"] = image_ids
-        clear = getattr(runner, "clear", None)
+    def rasterize_the_view(runner: Any, *args: Any, **kwargs: Any) -> Any:
+        clear, image_ids = getattr(runner, "clear", None), kwargs.get("image_ids")
         if clear is None or image_ids is None or not torch.is_grad_enabled():
             return rasterize_splats(runner, *args, **kwargs)
         with clear.rendering(clear.views[int(image_ids)]):
