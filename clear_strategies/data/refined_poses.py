@@ -145,11 +145,7 @@ def _adjusted(pycolmap: Any, work: Path, capture: Capture, groups: Groups, setti
                 model.deregister_frame(image.frame_id)
         if model.num_reg_images() < 2:
             return None
-        variables = pycolmap.BundleAdjustmentConfig()
-        for number in model.reg_image_ids():
-            variables.add_image(number)
-        variables.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        pycolmap.create_default_bundle_adjuster(adjustment, variables, model).solve()
+        features.adjust(pycolmap, model, adjustment)
     _align(pycolmap, model, frame_of)
     return model
 

@@ -1,4 +1,5 @@
-"""Features of photos and their matches, by pycolmap on the CPU: in a database, from copies of the photos, with bounded memory.
+"""What estimated and refined poses share: features of photos and their matches, by pycolmap on the CPU, in a database, from
+copies of the photos, with bounded memory; and bundle adjustment.
 
 COLMAP reads copies of the photos: upright JPEG files, no larger than needed.
 """
@@ -122,6 +123,15 @@ def find_and_match(pycolmap: Any, work: Path, groups: Groups, settings: SfmSetti
     _extract(pycolmap, database, groups, settings, root)
     _match(pycolmap, database, names, settings.threads)
     return database
+
+
+def adjust(pycolmap: Any, model: Any, options: Any) -> None:
+    """Bundle adjustment of all placed photos. `pycolmap.bundle_adjustment` does the same, but switches COLMAP's log on."""
+    variables = pycolmap.BundleAdjustmentConfig()
+    for number in model.reg_image_ids():
+        variables.add_image(number)
+    variables.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, variables, model).solve()
 
 
 def _sweep(cache: Path) -> None:

@@ -139,7 +139,7 @@ def _zoom(pycolmap: Any, model: Any, threads: int) -> float:
     options.refine_extra_params = options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.solver_options.num_threads = threads
-    pycolmap.bundle_adjustment(own, options)
+    features.adjust(pycolmap, own, options)
     lengths: dict[int, list[float]] = {}
     for number in numbers:
         if own.image(number).num_points3D >= _OBSERVED:

@@ -257,9 +257,11 @@ def photos_of_points(work: Path, centers: Sequence[Sequence[float]], focals: Seq
     ],
 )
 def test_photos_are_placed_however_the_camera_moves_and_zooms(
-    centers, focals, told: str, tmp_path, monkeypatch, caplog
+    centers, focals, told: str, tmp_path, monkeypatch, caplog, capfd
 ):
     files, database = photos_of_points(tmp_path, centers, focals)
+    monkeypatch.setattr(pycolmap.logging, "minloglevel", pycolmap.logging.Level.FATAL.value)
+    capfd.readouterr()
     monkeypatch.setattr(features, "find_and_match", lambda *_: database)
     (model,) = sfm._models(pycolmap, files, tmp_path, SfmSettings(threads=1))
     images = [model.images[number] for number in range(1, len(files) + 1)]
@@ -271,6 +273,7 @@ def test_photos_are_placed_however_the_camera_moves_and_zooms(
     )
     assert steps / steps[-1] == pytest.approx(true / true[-1], abs=0.01)
     assert (told in caplog.text) if told else not caplog.text
+    assert not capfd.readouterr().err  # of COLMAP's log
 
 
 def test_zoomed_photos_keep_their_poses_where_focal_lengths_of_their_own_give_none(tmp_path, monkeypatch, caplog):
