@@ -39,7 +39,7 @@ class Run:
     """A finished run; a DataError where the folder holds none.
 
     Args:
-        folder: of its files, which `docs/reference/files.md` lists.
+        folder: of its files, which `docs/reference/files.md` lists; made absolute.
         rasterizer: that draws it, as `clear-strategies render --rasterizer` takes it; None: the one that the run trained with. A
             class that `rasterizer._target_` named has to be named again, unless `train` returned the run: no file does it.
     """
@@ -48,7 +48,7 @@ class Run:
     rasterizer: str | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "folder", path_of(str(self.folder)))
+        object.__setattr__(self, "folder", path_of(str(self.folder)).absolute())  # a notebook may change its folder
         if not (self.folder / FINISHED).is_file():
             raise DataError(self.folder, FINISHED, "is not there, so no run has finished here", "train first")
 

@@ -90,6 +90,13 @@ def test_a_run_has_its_numbers_and_its_gaussians_by_gsplats_names_and_renders_fr
     assert not torch.equal(moved, picture)
 
 
+def test_a_run_is_found_after_the_working_directory_has_changed(run: cs.Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(run.folder.parent)
+    again = cs.Run(Path(run.folder.name))
+    monkeypatch.chdir(run.folder.parent.parent)
+    assert torch.equal(again.render(), run.render())
+
+
 def test_a_folder_without_a_finished_run_and_a_wrong_setting_are_told(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no run has finished here"):
         cs.Run(tmp_path)
