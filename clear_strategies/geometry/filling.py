@@ -24,7 +24,7 @@ from clear_strategies.core.points import PointCloud
 from clear_strategies.core.progress import told
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.photos import each_photo, is_background
-from clear_strategies.geometry.projection import back_project, sample_colors, seen_pixels
+from clear_strategies.geometry.projection import back_project, sample_colors, seen_pixels, slopes
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
@@ -145,18 +145,11 @@ def _completed(
 
 
 def _between(values: Float[Tensor, "h w"], at: Float[Tensor, "G 2"]) -> Float[Tensor, " G"]:
-    """The values at these places (column, row) between the pixels' centres: that of the pixel, continued along each axis by the
-    smaller of its slopes to both sides. This is exact on planes, and continues no surface across an edge.
-    """
+    """The values at these places (column, row) between the pixels' centres: that of the pixel, continued by its `slopes`."""
     column, row = (x.long().clamp(max=n - 1) for x, n in zip(at.T, reversed(values.shape), strict=True))
     result = values[row, column]
     for axis, pixel, place in ((1, column, at[:, 0]), (0, row, at[:, 1])):
-        step = values.diff(dim=axis).movedim(axis, 0)
-        if len(step) == 0:  # one row or column
-            continue
-        before, after = torch.cat((step[:1], step)), torch.cat((step, step[-1:]))
-        slope = torch.where(before.abs() < after.abs(), before, after) * (before * after > 0)
-        result = result + slope.movedim(0, axis)[row, column] * (place - pixel - 0.5)
+        result = result + slopes(values, axis)[row, column] * (place - pixel - 0.5)
     return result
 
 

@@ -1,4 +1,4 @@
-"""Projection of points to pixels and back, and sampling of colours. Pixel (0, 0) spans [0, 1)²."""
+"""Projection of points to pixels and back, sampling of colours, and slopes of depth. Pixel (0, 0) spans [0, 1)²."""
 
 from __future__ import annotations
 
@@ -80,3 +80,14 @@ def sample_colors(photo: Photo, pixels: Float[Tensor, "N 2"]) -> Float[Tensor, "
         return sampled(image)
     shown = photo.shown[..., None].to(image)
     return sampled(image * shown) / sampled(shown).clamp_min(_NO_WEIGHT)
+
+
+def slopes(values: Float[Tensor, "h w"], axis: int) -> Float[Tensor, "h w"]:
+    """The smaller of a pixel's differences from its two neighbours along an axis; 0 where their signs differ or one is nan. This
+    is exact on planes, and continues no surface across an edge.
+    """
+    step = values.diff(dim=axis)
+    if step.shape[axis] == 0:  # one row or column
+        return torch.zeros_like(values)
+    before, after = torch.cat((step.narrow(axis, 0, 1), step), axis), torch.cat((step, step.narrow(axis, -1, 1)), axis)
+    return torch.where(before * after > 0, torch.where(before.abs() < after.abs(), before, after), 0.0)

@@ -20,23 +20,27 @@ from torch import Tensor
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.cameras import moved_aside
 from clear_strategies.geometry.photos import is_background
-from clear_strategies.geometry.projection import inside, projection_matrix
+from clear_strategies.geometry.projection import inside, slopes
 from rasterizers.interface import Camera, Color
 
 _SOURCES: Final = 4  # the nearest photos that a pseudo view is warped from
+_STEEP: Final = (
+    0.3  # largest slope of a surface, change of its inverse depth from one pixel to the next relative to its own
+)
 _NEIGHBOURS: Final = 3  # least number of known pixels in a pixel's 3 × 3 window; with fewer, it is an outlier
 
 
 class _Source(NamedTuple):
-    """A photo with depth: its points, its depth, 0 where its colours are not used, and the median of its depth.
+    """A photo with depth, nan where unknown, the planes of its surfaces, True where its colours are used, and the median depth.
 
-    Points are in camera coordinates, so that float32 resolves them wherever the world's origin is, and stored as rows x, y, z, so
-    that torch computes with contiguous coordinates.
+    The plane p of a pixel is that of the points X with p · X = 1. Points and planes are in camera coordinates, so that float32
+    resolves them wherever the world's origin is, and stored as rows x, y, z, so that torch computes with contiguous coordinates.
     """
 
     photo: Photo
-    points: Float[Tensor, "3 N"]
     depth: Float[Tensor, "h w"]
+    planes: Float[Tensor, "3 N"]
+    colored: Bool[Tensor, " N"]
     median: float
 
 
@@ -92,11 +96,19 @@ def border_view(photo: Photo, *, field: float, max_pixels: int) -> Photo:
 
 def _source(photo: Photo, depth_map: DepthMap, background: Color) -> _Source:
     """Make a source. The colours beside the background, or beside what a mask hides, are mixed with it, and not used."""
-    known, depth = depth_map.known, torch.nan_to_num(depth_map.depth)
-    points = _behind(photo.camera, depth)[:, known.flatten()]
+    known = depth_map.known
+    depth = torch.where(known, depth_map.depth, torch.nan)
     apart = is_background(photo.image, background) | ~photo.visible
     mixed = F.max_pool2d(apart[None, None].float(), 3, 1, 1)[0, 0] > 0
-    return _Source(photo, points, torch.where(known & ~mixed, depth, 0.0), float(depth[known].median()))
+    return _Source(photo, depth, _planes(photo.camera, depth), (known & ~mixed).flatten(), float(depth[known].median()))
+
+
+def _planes(camera: Camera, depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 N"]:
+    """The plane of the surface at each pixel. Inverse depth, p · (x, y, 1), is linear on it."""
+    inverse = 1 / depth
+    across, down = camera.fx * slopes(inverse, 1), camera.fy * slopes(inverse, 0)
+    x, y = _rays(camera, depth.device)
+    return torch.stack((across, down, inverse - x * across - y * down)).flatten(1)
 
 
 def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> Photo:
@@ -119,20 +131,32 @@ def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> Pho
 
 
 def _front(camera: Camera, sources: Sequence[_Source]) -> Float[Tensor, "h w"]:
-    """The depth of the nearest point at each pixel, infinite without one. A point covers 2 × 2 pixels, which closes holes."""
-    width, height = camera.width + 1, camera.height + 1
+    """The depth of the nearest surface at each pixel, infinite without one. A point covers the 2 × 2 pixels around it, which
+    closes holes, at the depths of its plane there: seen at a grazing angle, a surface is much nearer a pixel further.
+    """
+    width, height = camera.width + 2, camera.height + 2  # with a border of one pixel
     outside = height * width
-    front = sources[0].depth.new_full((outside + 1,), torch.inf)
+    front = sources[0].depth.new_zeros(outside + width + 2)  # the inverse depth
     for s in sources:
-        x, y, depth = _projected(s.points, s.photo.camera, camera)
-        # The lower right one of its four pixels, with a border of one pixel.
-        column, row = x.add_(0.5).floor_(), y.add_(0.5).floor_()
-        shown = inside(column, row, depth, width, height)
-        place = torch.where(shown, row.mul_(width).add_(column), outside).long()
-        front.scatter_reduce_(0, place, depth, "amin")
-    front = front[:outside].reshape(height, width)
-    front = torch.minimum(front[:-1], front[1:])
-    return torch.minimum(front[:, :-1], front[:, 1:])
+        points = _moved(_behind(s.photo.camera, s.depth), s.photo.camera, camera)
+        x, y = _pixels(camera, points)
+        column, row = (x + 0.5).floor_(), (y + 0.5).floor_()  # of the upper left one of the four pixels
+        shown = inside(column, row, points[2], width - 1, height - 1)
+        place = torch.where(shown, row.mul(width).add_(column), outside).long()
+        inverse = 1 / points[2]
+        limit = _STEEP * inverse
+        across, down = (slope.clamp_(-limit, limit) for slope in _slopes(s, camera))
+        value = inverse + across * (column - 0.5 - x) + down * (row - 0.5 - y)
+        for step, change in ((0, 0.0), (1, across), (width, down), (width + 1, across + down)):
+            front.scatter_reduce_(0, place + step, value + change, "amax")
+    return 1 / front[:outside].reshape(height, width)[1:-1, 1:-1]
+
+
+def _slopes(source: _Source, camera: Camera) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
+    """How much the inverse depth of the source's planes, seen from another camera, changes per (column, row)."""
+    turn, shift = _move(camera, source.photo.camera, source.planes)
+    across, down, _ = turn.T @ source.planes / (1 - shift.T @ source.planes)
+    return across / camera.fx, down / camera.fy
 
 
 def _seen(
@@ -140,28 +164,47 @@ def _seen(
 ) -> tuple[Bool[Tensor, " N"], Float[Tensor, "3 N"]]:
     """(True where the photo shows a point of the camera, i.e. its depth there agrees up to `tolerance`; the photo's colours)."""
     own = source.photo.camera
-    x, y, depth = _projected(points, camera, own)
-    shown = inside(x, y, depth, own.width, own.height)
+    points = _moved(points, camera, own)
+    x, y = _pixels(own, points)
+    shown = inside(x, y, points[2], own.width, own.height)
     place = torch.where(shown, y.floor().mul_(own.width).add_(x.floor()), 0.0).long()
+    nearer = (source.planes[:, place] * points).sum(0)  # than the surface on the same ray, by this factor
     grid = torch.view_as_real(torch.complex(x.mul_(2 / own.width).sub_(1), y.mul_(2 / own.height).sub_(1)))
     image = source.photo.image.permute(2, 0, 1)[None]
     colors = F.grid_sample(image, grid[None, None], padding_mode="border", align_corners=False)[0, :, 0]
-    return shown & ((source.depth.flatten()[place] / depth - 1).abs() <= tolerance), colors
+    return shown & source.colored[place] & ((1 / nearer - 1).abs() <= tolerance), colors
 
 
-def _projected(points: Float[Tensor, "3 N"], of: Camera, to: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Project points in coordinates of one camera to (columns, rows, depths) of another, meaningful where depth > 0."""
-    matrix = (projection_matrix(to) @ torch.linalg.inv(of.world_to_camera.double())).to(points)
-    x, y, depth = torch.addmm(matrix[:, 3:], matrix[:, :3], points)
-    return x.div_(depth), y.div_(depth), depth
+def _move(of: Camera, to: Camera, like: Tensor) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3 1"]]:
+    """The rotation and translation from coordinates of one camera to those of another."""
+    move = (to.world_to_camera.double() @ torch.linalg.inv(of.world_to_camera.double())).to(like)
+    return move[:3, :3], move[:3, 3:]
+
+
+def _moved(points: Float[Tensor, "3 N"], of: Camera, to: Camera) -> Float[Tensor, "3 N"]:
+    """Points in coordinates of one camera, in those of another."""
+    turn, shift = _move(of, to, points)
+    return torch.addmm(shift, turn, points)
+
+
+def _pixels(camera: Camera, points: Float[Tensor, "3 N"]) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
+    """(columns, rows) of points in the camera's coordinates, meaningful where they lie before it."""
+    x, y, depth = points
+    return (x / depth).mul_(camera.fx).add_(camera.cx), (y / depth).mul_(camera.fy).add_(camera.cy)
 
 
 def _behind(camera: Camera, depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 N"]:
     """The points on the rays of all pixels at these depths, in camera coordinates."""
-    numbers = partial(torch.arange, dtype=torch.float64, device=depth.device)
+    x, y = _rays(camera, depth.device)
+    return torch.stack((x * depth, y * depth, depth)).flatten(1)
+
+
+def _rays(camera: Camera, device: torch.device) -> tuple[Float[Tensor, " w"], Float[Tensor, "h 1"]]:
+    """The rays through the pixels: x / z of each column and y / z of each row."""
+    numbers = partial(torch.arange, dtype=torch.float64, device=device)
     x = (numbers(camera.width) + (0.5 - camera.cx)) / camera.fx
     y = (numbers(camera.height) + (0.5 - camera.cy)) / camera.fy
-    return torch.stack((x.float() * depth, y.float()[:, None] * depth, depth)).flatten(1)
+    return x.float(), y.float()[:, None]
 
 
 def continued(image: Float[Tensor, "h w 3"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:

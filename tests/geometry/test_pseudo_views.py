@@ -63,6 +63,39 @@ def test_a_plane_is_seen_as_its_photos_show_it():
         assert error[inside.any(0)].median() < 0.02
 
 
+def test_a_surface_seen_at_a_grazing_angle_is_known_and_in_its_place():
+    slope, photos, depths = 3.7, {}, {}  # the plane z + 3.7 x = 4, tilted by 75 degrees
+
+    def on_plane(camera):
+        """Where the rays of the camera's pixels meet the plane."""
+        pixels = torch.cartesian_prod(torch.arange(camera.height), torch.arange(camera.width)).flip(1) + 0.5
+        near, far = (back_project(camera, pixels, torch.full((len(pixels),), z).double()).double() for z in (1.0, 2.0))
+        side = torch.tensor([slope, 0.0, 1.0]).double()
+        return near + ((4 - near @ side) / ((far - near) @ side))[:, None] * (far - near)
+
+    def colors(points):
+        return (0.5 + 0.4 * torch.sin(points @ torch.tensor([[3.0, -1, 2], [1, 2, -2], [-1, 1, 1]]).double())).float()
+
+    for i, x in enumerate((0.0, 0.4, -0.4)):
+        camera = planes.camera(x, 120, 90)
+        points, shape = on_plane(camera), (camera.height, camera.width)
+        depth = points[:, 2].float().view(shape)
+        photo = photos[f"{i}.png"] = Photo(camera, colors(points).view(*shape, 3))
+        depths[f"{i}.png"] = depth_of(photo, torch.where((depth > 0) & (depth < 20), depth, torch.nan))
+    known = shown = 0
+    for view in views_of(photos, depths):
+        points = on_plane(view.camera)
+        expected = torch.zeros(len(points), dtype=torch.bool)
+        for photo in photos.values():
+            xy, depth = project(photo.camera, points)
+            expected |= (depth > 0) & (depth < 15) & (xy > 1).all(1) & (xy < torch.tensor([119, 89])).all(1)
+        expected &= project(view.camera, points)[1] > 0
+        at = view.shown.flatten() & expected
+        known, shown = known + int(at.sum()), shown + int(expected.sum())
+        assert (view.image.view(-1, 3)[at] - colors(points[at])).abs().mean() < 0.01
+    assert known > 0.97 * shown, (known, shown)
+
+
 def test_without_two_photos_with_depth_there_are_none_and_large_ones_are_reduced():
     photos = plane(2)
     one = {"0.png": depth_of(photos["0.png"], DEPTH), "1.png": depth_of(photos["1.png"], torch.nan)}
