@@ -34,7 +34,7 @@ from clear_strategies.data.scene_notes import scene_notes, size_of
 from clear_strategies.data.view_names import ViewFiles, write_pngs
 from clear_strategies.data.view_settings import ViewSettings, lr_size, split
 from clear_strategies.errors import DataError
-from clear_strategies.geometry.cameras import centers_of
+from clear_strategies.geometry.cameras import centers_of, warn_if_far
 from clear_strategies.geometry.exposure import exposure_gains
 from rasterizers.interface import Camera
 
@@ -45,7 +45,6 @@ _SAME_EXPOSURE: Final = 0.01  # photos whose gains are closer to 1 stay as they 
 # Radius of the cameras' positions around their mean …
 _ONE_PLACE: Final = 1e-6  # … over their distance from the origin, up to which rounding in files explains it
 _NO_STEP: Final = 1e-3  # … over that of the points, up to which parallax is less than two pixels of a photo of 2,000
-_BLURRED: Final = 3e-4  # rounding of positions over that radius, from which it is a visible part of an HR pixel
 
 
 def prepare(
@@ -223,8 +222,8 @@ def _sized(photo: Photo, views: ViewSettings) -> Photo:
 
 
 def _check_positions(capture: Capture, cameras: Sequence[Camera], cloud: CloudSettings) -> None:
-    """Raise a DataError if all photos are from one place, since depth is then unknown, unless a file gives the points. Warn if
-    float32 cannot resolve positions to a fraction of a pixel, as with geographic coordinates.
+    """Raise a DataError if all photos are from one place, since depth is then unknown, unless a file gives the points. Warn
+    if they are far from the origin.
     """
     centers = centers_of(cameras)
     middle = centers.mean(0)
@@ -235,10 +234,4 @@ def _check_positions(capture: Capture, cameras: Sequence[Camera], cloud: CloudSe
     if apart <= least and len(cameras) > 1 and cloud.init != "ply":
         remedy = f"{STEP_ASIDE}; or give the depth: data.cloud.init=ply data.cloud.path=POINTS.ply"
         raise DataError(capture.name, "poses", f"{NO_PARALLAX} (cameras within {apart:.2g} units)", remedy)
-    rounded = away * torch.finfo(torch.float32).eps / 2
-    if rounded > _BLURRED * apart > 0:
-        _log.warning(
-            "the cameras lie within %.3g units of their mean but %.3g from the origin, where float32 rounds positions to %.2g: "
-            "stereo and training lose detail. Subtract the same point from all camera centres and points of the capture.",
-            apart, away, rounded,
-        )  # fmt: skip
+    warn_if_far(centers)

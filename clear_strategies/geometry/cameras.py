@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,14 +17,30 @@ from torch import Tensor
 from clear_strategies.core.view import Photo
 from rasterizers.interface import Camera
 
+_log = logging.getLogger(__name__)
+
 _PARTNERS: Final = 12  # photos that a photo is compared with
 _NEAREST: Final = 8  # nearest photos among them
+_BLURRED: Final = 3e-4  # rounding of positions over the cameras' radius, from which an HR pixel visibly moves
 _ALONG: Final = 0.3  # factor of movements along the viewing direction, since moving closer leaves holes
 
 
 def centers_of(cameras: Sequence[Camera]) -> Float[Tensor, "C 3"]:
     """The positions of the cameras, float64 on the CPU."""
     return torch.stack([camera.center.double().cpu() for camera in cameras])
+
+
+def warn_if_far(centers: Float[Tensor, "C 3"]) -> None:
+    """Warn if float32 cannot resolve positions near the cameras to a fraction of a pixel, as with geographic coordinates."""
+    middle = centers.mean(0)
+    apart, away = float((centers - middle).norm(dim=1).max()), float(middle.norm())
+    rounded = away * torch.finfo(torch.float32).eps / 2
+    if rounded > _BLURRED * apart > 0:
+        _log.warning(
+            "the cameras lie within %.3g units of their mean but %.3g from the origin, where float32 rounds positions to %.2g: "
+            "stereo and training lose detail. Subtract the same point from all camera centres and points of the capture.",
+            apart, away, rounded,
+        )  # fmt: skip
 
 
 def common_box(photos: Sequence[Photo]) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:

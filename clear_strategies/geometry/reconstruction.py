@@ -13,6 +13,7 @@ from clear_strategies.core.checks import as_color
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.errors import DataError
+from clear_strategies.geometry.cameras import centers_of, warn_if_far
 from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
@@ -80,6 +81,7 @@ def stereo(
     color = None if background is None else as_color("background", list(background))
     settings = settings or StereoSettings()
     photos = _photos(images, world_to_camera, Ks, masks)
+    warn_if_far(centers_of([photo.camera for photo in photos]))
     known = features_of(photos) if features is None else _features(*features)
     known = known[_unhidden(known.means, photos).nonzero()[:, 0]]
     maps = depth_maps(photos, known.means, settings, color)

@@ -56,6 +56,13 @@ def test_the_cloud_of_the_demo_is_the_trainers_to_the_bit() -> None:
     )
 
 
+def test_a_warning_says_that_float32_blurs_positions_far_from_the_origin(caplog: pytest.LogCaptureFixture) -> None:
+    given = arguments(plane_photos(2, 64, 48))
+    given["world_to_camera"][:, 2, 3] -= 1e5
+    stereo(**given)
+    assert "1e+05 from the origin" in caplog.text
+
+
 def test_torchs_default_device_plays_no_part(plane: Stereo) -> None:
     given = arguments(plane_photos(3, 64, 48))
     with torch.device("meta"):  # a host's may be a GPU
