@@ -215,7 +215,9 @@ def _without_thumbnails(headers: Mapping[Path, Header]) -> dict[Path, Header]:
 
 
 def _cache_key(paths: Sequence[Path], *settings: int) -> str:
-    version = "upright copies, points of two views, affine, EXIF on trial, a camera for each lens, forward motion, zoom, sound"
+    version = (
+        "upright copies, points of two views, affine, EXIF on trial, a camera a lens, forward motion, zoom, sound, tele"
+    )
     digest = hashlib.sha256(repr((version, *settings)).encode())
     for path in paths:
         digest.update(path.name.encode() + b"\0" + path.read_bytes())

@@ -94,12 +94,13 @@ def _models(pycolmap: Any, photos: Mapping[Path, Header], work: Path, settings: 
     groups, root = _write_copies(photos, work / features.COPIES, settings.max_side), next(iter(photos)).parent
     database = features.find_and_match(pycolmap, work, groups, settings, root)
     _require_parallax(pycolmap, database, root)
-    models, count = _mapped(pycolmap, work, len(photos), settings), len(photos)
+    distortion, count = _most_distortion(pycolmap, database), len(photos)
+    models = _mapped(pycolmap, work, count, settings, distortion)
     lengths = sorted({said.focal_35mm for said in photos.values() if said.focal_35mm is not None})
     if (placed := _most_placed(models)) < count and lengths:
         _log.info("%d of %d photos are placed: again, without EXIF's focal length.", placed, count)
         _forget_focal_lengths(pycolmap, database, settings.threads)
-        free = _mapped(pycolmap, work, count, settings)
+        free = _mapped(pycolmap, work, count, settings, distortion)
         if (more := _most_placed(free)) > placed:
             models, told = free, some([f"{focal:g} mm" for focal in lengths])
             message = (
@@ -109,13 +110,13 @@ def _models(pycolmap: Any, photos: Mapping[Path, Header], work: Path, settings: 
     largest = max(models, key=lambda model: model.num_reg_images(), default=None)
     if largest is not None and (zoom := _zoom(pycolmap, largest, settings.threads)) > _ZOOM:
         _forget_focal_lengths(pycolmap, database, settings.threads, share=False)
-        own = _sound(pycolmap, _mapped(pycolmap, work, count, settings))
+        own = _sound(pycolmap, _mapped(pycolmap, work, count, settings, distortion), distortion)
         models, told = (
             (own, "Each photo gets its own") if _most_placed(own) >= FEWEST else (models, "Poses may be wrong")
         )
         message = "%s: the photos are zoomed: focal lengths of one camera differ by a factor of %.2g. %s."
         _log.warning(message, root, zoom, told)
-    if not (models := _sound(pycolmap, models)):
+    if not (models := _sound(pycolmap, models, distortion)):
         _require_unmatched(pycolmap, database, root)
     return models
 
@@ -147,13 +148,14 @@ def _zoom(pycolmap: Any, model: Any, threads: int) -> float:
     return max((max(of) / min(of) for of in lengths.values()), default=1.0)
 
 
-def _mapped(pycolmap: Any, work: Path, count: int, settings: SfmSettings) -> list[Any]:
-    """Run COLMAP's mapper on the verified pairs; returns the models."""
+def _mapped(pycolmap: Any, work: Path, count: int, settings: SfmSettings, distortion: float) -> list[Any]:
+    """Run COLMAP's mapper on the verified pairs, with this largest |k1| of a camera; returns the models."""
     mapping = pycolmap.IncrementalPipelineOptions()
     mapping.num_threads, mapping.random_seed = settings.threads, settings.seed
     # COLMAP's thresholds are for hundreds of photos: they place four of ten photos around a table, these place six.
     mapping.mapper.init_min_num_inliers, mapping.mapper.init_min_tri_angle = 50, 8.0
     mapping.mapper.abs_pose_min_num_inliers = 15
+    mapping.max_extra_param = distortion
     # The first two photos may lie one behind the other, as of a dolly: the angle above already demands parallax.
     mapping.mapper.init_max_forward_motion = 1.0
     # With few photos most points are seen by two only. These points make the six poses four times more exact.
@@ -170,15 +172,25 @@ def _mapped(pycolmap: Any, work: Path, count: int, settings: SfmSettings) -> lis
     return list(models.values())
 
 
-def _sound(pycolmap: Any, models: Sequence[Any]) -> list[Any]:
+def _sound(pycolmap: Any, models: Sequence[Any], distortion: float) -> list[Any]:
     """Remove photos without points or with diverged cameras, as COLMAP does from 20 photos on; returns models with points."""
     limits = pycolmap.IncrementalPipelineOptions()
-    cameras = limits.min_focal_length_ratio, limits.max_focal_length_ratio, limits.max_extra_param
+    lengths = limits.min_focal_length_ratio, limits.max_focal_length_ratio
     for model in models:
-        for frame in pycolmap.ObservationManager(model).filter_frames(*cameras, 1):
+        for frame in pycolmap.ObservationManager(model).filter_frames(*lengths, distortion, 1):
             model.deregister_frame(frame)
         model.tear_down()  # forgets what is not registered
     return [model for model in models if model.num_points3D()]
+
+
+def _most_distortion(pycolmap: Any, database: Path) -> float:
+    """The largest |k1| of a sound camera. COLMAP's limit suits its default focal length; a lens that is n times as long, as EXIF
+    tells, sees 1/n of the field, where n² times the k1 distorts as much.
+    """
+    with pycolmap.Database.open(database) as opened:
+        cameras = opened.read_all_cameras()
+    longest = max(c.mean_focal_length() / max(c.width, c.height) for c in cameras)
+    return float(pycolmap.IncrementalPipelineOptions().max_extra_param * max(1.0, longest / _UNKNOWN) ** 2)
 
 
 def _most_placed(models: Sequence[Any]) -> int:

@@ -228,20 +228,26 @@ def database_of(
     return found
 
 
-def photos_of_points(work: Path, centers: Sequence[Sequence[float]], focals: Sequence[float]) -> tuple[dict, Path]:
+def photos_of_points(
+    work: Path, centers: Sequence[Sequence[float]], focals: Sequence[float], known: float = 0.0, k1: float = 0.0
+) -> tuple[dict, Path]:
     """Photos of 640x480, turned by up to 20 degrees, that share a camera; and COLMAP's database of their matched features, which
-    are projections of 400 points with noise of 0.2 pixels.
+    are projections of 400 points with noise of 0.2 pixels. A `known` focal length is from as much further away.
     """
     rng = np.random.default_rng(0)
     points = rng.uniform((-3, -2, 4), (3, 2, 9), (400, 3))
     (work / "photos").mkdir()
     with pycolmap.Database.open(work / features.DATABASE) as database:
-        camera = database.write_camera(pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 768.0, 640, 480))
+        camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", known or 768.0, 640, 480)
+        camera.has_prior_focal_length = known > 0
+        camera = database.write_camera(camera)
         for number, (center, focal) in enumerate(zip(centers, focals, strict=True)):
             Image.new("RGB", (640, 480)).save(work / "photos" / f"{number}.png")
             image = database.write_image(pycolmap.Image(sfm.copy_name(number), camera_id=camera))
             x, y, z = Rotation.from_euler("y", -8 * center[0], degrees=True).apply(points - center).T
-            seen = focal * np.stack((x / z, y / z), -1) + (320, 240) + rng.normal(size=(400, 2)) * 0.2
+            ray = np.stack((x, y), -1) / (z + 6.5 * max(0, known / 520 - 1))[:, None]
+            ray *= 1 + k1 * (ray**2).sum(1, keepdims=True)
+            seen = focal * ray + (320, 240) + rng.normal(size=(400, 2)) * 0.2
             database.write_keypoints(image, seen.astype(np.float32))
         for one, other in itertools.combinations(range(1, len(centers) + 1), 2):
             database.write_matches(one, other, np.arange(400, dtype=np.uint32)[:, None].repeat(2, 1))
@@ -276,6 +282,16 @@ def test_photos_are_placed_however_the_camera_moves_and_zooms(
     assert not capfd.readouterr().err  # of COLMAP's log
 
 
+def test_photos_of_a_long_lens_are_placed_though_its_k1_is_large(tmp_path, monkeypatch):
+    """300 mm on 35 mm film, known by EXIF, with a distortion of 1 % at the corners."""
+    focal, k1 = 5333.0, 0.01 / (400 / 5333) ** 2
+    files, database = photos_of_points(tmp_path, [(x, 0, 0) for x in range(-3, 4)], [focal] * 7, known=focal, k1=k1)
+    monkeypatch.setattr(features, "find_and_match", lambda *_: database)
+    (model,) = sfm._models(pycolmap, files, tmp_path, SfmSettings(threads=1))
+    assert model.num_reg_images() == 7
+    assert [camera.params[3] for camera in model.cameras.values()] == pytest.approx([k1], rel=0.05)
+
+
 def test_zoomed_photos_keep_their_poses_where_focal_lengths_of_their_own_give_none(tmp_path, monkeypatch, caplog):
     files, database = photos_of_points(tmp_path, [(x, 0, 0) for x in range(4)], [520] * 4)
     monkeypatch.setattr(features, "find_and_match", lambda *_: database)
@@ -308,7 +324,7 @@ def test_a_model_without_points_counts_as_none() -> None:
     for number in (1, 2, 3):
         photo = pycolmap.Image(sfm.copy_name(number), keypoints=np.zeros((5, 2)), camera_id=1, image_id=number)
         empty.add_image_with_trivial_frame(photo, pycolmap.Rigid3d())
-    assert sfm._sound(pycolmap, [empty]) == []
+    assert sfm._sound(pycolmap, [empty], 1.0) == []
 
 
 def test_a_photo_without_a_pose_is_told_with_the_placed_photo_that_it_has_most_in_common_with(tmp_path: Path) -> None:
