@@ -33,7 +33,9 @@ CAMERA_MODELS: Final = {
 # The coefficients that OpenCV undistorts, in its order; those that a model has beside them must be 0.
 _PERSPECTIVE: Final = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE: Final = ("k1", "k2", "k3", "k4")
-_UNDISTORT: Final = "colmap image_undistorter --image_path images --input_path sparse/0 --output_path undistorted"
+_UNDISTORT: Final = (
+    "with a COLMAP model, colmap image_undistorter --image_path images --input_path sparse/0 --output_path undistorted"
+)
 CUT: Final = (
     "cut panoramas into flat photos: "
     "ns-process-data images --camera-type equirectangular --data images --output-dir flat"
@@ -96,7 +98,7 @@ class Lens:
         if pinhole is None:
             problem = f"{self.distortion} cannot be removed from a {self.width}x{self.height} image"
             raise DataError(
-                file, "distortion", problem, f"check the camera, or undistort the images first: {_UNDISTORT}"
+                file, "distortion", problem, f"check the camera, or undistort the images first; {_UNDISTORT}"
             )
         return pinhole
 
@@ -140,7 +142,7 @@ def lens_of(
     kept = terms_of(file, where, model)
     if rest := [name for name, value in terms.items() if value != 0 and name not in kept]:
         problem = f"has {rest[0]} = {terms[rest[0]]:g}; of the camera model {model} it must be 0"
-        raise DataError(file, where, problem, f"check the model, or undistort the photos first: {_UNDISTORT}")
+        raise DataError(file, where, problem, f"check the model, or undistort the photos first; {_UNDISTORT}")
     lens = Lens(*size, *pinhole, tuple(terms.get(name, 0.0) for name in kept), "FISHEYE" in model)
     (width, height), (fx, fy, cx, cy) = size, pinhole
     if not all(abs(x) < FARTHEST for x in (*pinhole, *lens.distortion)):  # not for nan
@@ -167,7 +169,7 @@ def terms_of(file: Path, where: str, model: str) -> tuple[str, ...]:
     if parameters := CAMERA_MODELS.get(model, "").split():
         extra = ["k3"] if model == "OPENCV" else []  # nerfstudio adds k3, and a k4 that is not OpenCV's
         return tuple(k for k in (_FISHEYE if "FISHEYE" in model else _PERSPECTIVE) if k in [*parameters, *extra])
-    remedy = CUT if model == "EQUIRECTANGULAR" else f"undistort the photos first: {_UNDISTORT}"
+    remedy = CUT if model == "EQUIRECTANGULAR" else f"undistort the photos first; {_UNDISTORT}"
     raise DataError(file, where, f"has the camera model {model[:40]}, which is not supported", remedy)
 
 
