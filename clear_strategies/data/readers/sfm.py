@@ -107,17 +107,18 @@ def _models(pycolmap: Any, photos: Mapping[Path, Header], work: Path, settings: 
                 "%s: EXIF's focal length (%s on 35 mm film) is not used: %d of %d photos are placed with it, %d without"
             )
             _log.warning(message, root, told, placed, count, more)
-    largest = max(models, key=lambda model: model.num_reg_images(), default=None)
+    largest, zoomed = max(models, key=lambda model: model.num_reg_images(), default=None), ""
     if largest is not None and (zoom := _zoom(pycolmap, largest, settings.threads)) > _ZOOM:
         _forget_focal_lengths(pycolmap, database, settings.threads, share=False)
         own = _sound(pycolmap, _mapped(pycolmap, work, count, settings, distortion), distortion)
         models, told = (
             (own, "Each photo gets its own") if _most_placed(own) >= FEWEST else (models, "Poses may be wrong")
         )
-        message = "%s: the photos are zoomed: focal lengths of one camera differ by a factor of %.2g. %s."
-        _log.warning(message, root, zoom, told)
+        zoomed = f"focal lengths of one camera differ by a factor of {zoom:.2g}. {told}."
     if not (models := _sound(pycolmap, models, distortion)):
         _require_unmatched(pycolmap, database, root)
+    elif zoomed:
+        _log.warning("%s: the photos are zoomed: %s", root, zoomed)
     return models
 
 

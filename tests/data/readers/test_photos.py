@@ -311,11 +311,15 @@ def test_zoomed_photos_keep_their_poses_where_focal_lengths_of_their_own_give_no
         [(x / 5, 0, 0) for x in range(4)],  # no model at all
     ],
 )
-def test_too_little_parallax_is_told_as_such_where_photos_match_but_give_no_sound_model(centers, tmp_path, monkeypatch):
+def test_too_little_parallax_is_told_as_such_where_photos_match_but_give_no_sound_model(
+    centers, tmp_path, monkeypatch, caplog
+):
     files, database = photos_of_points(tmp_path, centers, [520] * len(centers))
     monkeypatch.setattr(features, "find_and_match", lambda *_: database)
+    monkeypatch.setattr(sfm, "_ZOOM", 0)  # focal lengths mean nothing without parallax
     with pytest.raises(DataError, match=r"too little parallax: .*: take a step to the side"):
         sfm._models(pycolmap, files, tmp_path, SfmSettings(threads=1))
+    assert "zoomed" not in caplog.text
 
 
 def test_a_model_without_points_counts_as_none() -> None:
