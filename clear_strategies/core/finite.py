@@ -44,6 +44,13 @@ def rows_not_finite(x: Tensor) -> str:
     return f"is not finite for {counted(int(rows.sum()), 'Gaussian')}, first Gaussian {int(rows.nonzero()[0])}"
 
 
+def pixels_not_finite(x: Tensor) -> str:
+    """Describe the pixels of an image that are not finite, or of several images [K, H, W, 3]."""
+    bad = (~torch.isfinite(x)).any(-1).view(-1, *x.shape[-3:-1]).any(0)
+    row, column = bad.nonzero()[0].tolist()
+    return f"is not finite at {counted(int(bad.sum()), 'pixel')}, first pixel ({column}, {row})"
+
+
 def require_finite_losses(where: str, losses: Mapping[str, Number], images: Mapping[str, Tensor]) -> None:
     """Check the losses of a view; those on a device are not read.
 
@@ -58,10 +65,5 @@ def require_finite_losses(where: str, losses: Mapping[str, Number], images: Mapp
             continue
         for image, x in images.items():
             if not is_finite(x):
-                bad = (~torch.isfinite(x)).any(-1)
-                row, column = bad.nonzero()[0].tolist()
-                raise DivergedError(
-                    f"{where}: the loss {name} is {value}, since {image} is not finite at {counted(int(bad.sum()), 'pixel')}, "
-                    f"first pixel ({column}, {row})."
-                )
+                raise DivergedError(f"{where}: the loss {name} is {value}, since {image} {pixels_not_finite(x)}.")
         raise DivergedError(f"{where}: the loss {name} is {value} although both images are finite.")

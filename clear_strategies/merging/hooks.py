@@ -29,6 +29,7 @@ from clear_strategies.strategies.answers import (
     is_real,
     refuse,
     require_finite,
+    require_finite_cotangents,
     require_not_negative,
     require_stored,
     rows_like,
@@ -403,6 +404,7 @@ def _compared(
     if not is_real(found.cotangents, tuple(shape)):
         rule = f"Losses whose cotangents are a tensor {[*shape]}; add a loss to one of them"
         refuse(s, "compare", rule, found.cotangents)
+    require_finite_cotangents(s, scale, inner[0], found.cotangents)
     return found._replace(values={**inner[0].values, **found.values})
 
 

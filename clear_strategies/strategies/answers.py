@@ -10,13 +10,15 @@ from collections.abc import Mapping
 from typing import Any, NoReturn
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import deferred
-from clear_strategies.core.finite import is_finite, rows_not_finite
+from clear_strategies.core.finite import is_finite, pixels_not_finite, rows_not_finite
 from clear_strategies.core.gradients import Grads, in_our_shapes
+from clear_strategies.core.step import Losses
 from clear_strategies.errors import AnswerError
-from clear_strategies.strategies.base import Strategy
+from clear_strategies.strategies.base import Scale, Strategy
 
 
 def require_stored(s: Strategy, params: Mapping[str, Tensor]) -> None:
@@ -60,6 +62,14 @@ def require_finite(s: Strategy, hook: str, numbers: Mapping[str, float | Tensor]
         if not finite:
             found = rows_not_finite(x) if isinstance(x, Tensor) and x.dim() else f"is {float(x)}"
             raise AnswerError(f"{_named(s, hook)} must give finite numbers, but {name} {found}.")
+
+
+def require_finite_cotangents(s: Strategy, scale: Scale, given: Losses, cotangents: Float[Tensor, "K H W 3"]) -> None:
+    """Finite numbers, unless the losses that the strategy was given are not finite, of which another error tells."""
+    from_others = any(isinstance(x, float) and not math.isfinite(x) for x in given.values.values())
+    if not from_others and deferred.is_immediate(cotangents) and not is_finite(cotangents):
+        found = f"at {scale.upper()} its gradient of the image {pixels_not_finite(cotangents)}"
+        raise AnswerError(f"{_named(s, 'compare')} must give finite cotangents, but {found}.")
 
 
 def require_not_negative(s: Strategy, hook: str, name: str, x: Tensor) -> None:

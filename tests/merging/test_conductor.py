@@ -873,6 +873,11 @@ def test_cotangents_that_a_strategy_stores_are_its_own(drawn):
 
 
 def test_a_comparison_must_pass_on_the_losses_of_one_image(drawn):
+    def not_finite(scale, image, photo, step, losses):
+        found = losses(image)
+        found.cotangents[0, 3, 2] = float("nan")
+        return found
+
     twice = "must call losses.image. once, but calls it again"
     faults = {
         "must give the Losses that losses": lambda scale, image, photo, step, losses: losses(image).values,
@@ -881,6 +886,7 @@ def test_a_comparison_must_pass_on_the_losses_of_one_image(drawn):
         "must give Losses whose cotangents are a tensor": lambda scale, image, photo, step, losses: losses(
             image
         )._replace(cotangents=torch.zeros(3, *image.shape)),
+        "must give finite cotangents, but at LR its gradient of the image is not finite at 1 pixel, first": not_finite,
     }
     for message, compare in faults.items():
         with pytest.raises(AnswerError, match=rf"compare\(\) {message}"):
