@@ -20,6 +20,7 @@ SMALLEST: Final = 12
 """Pixels on each side of what can be scored: GMSD halves the image, and SSIM needs room for its window."""
 _WHOLE: Final = 0.99  # least share of a resized pixel that the mask shows, for the pixel to be shown
 _KNOWN_SHARE: Final = 0.3  # of a block's pixels, for its depth to be known
+_ONE_SURFACE: Final = 1.05  # ratio of two depths, up to which a depth between them lies on their surface
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,7 +147,9 @@ class DepthMap:
         known = (confidence > 0).float().mean(dim=-1)
         enough = known >= _KNOWN_SHARE
         mean = confidence.mean(dim=-1) / known.clamp_min(torch.finfo(known.dtype).tiny)
-        return DepthMap(torch.where(enough, depth.nanmedian(dim=-1).values, torch.nan), torch.where(enough, mean, 0.0))
+        nearer, farther = depth.nanmedian(dim=-1).values, -(-depth).nanmedian(dim=-1).values  # the two in the middle
+        median = torch.where(farther <= _ONE_SURFACE * nearer, (nearer + farther) / 2, nearer)
+        return DepthMap(torch.where(enough, median, torch.nan), torch.where(enough, mean, 0.0))
 
     def completed_by(self, other: DepthMap) -> DepthMap:
         """This map, and `other`, a map of the same photo, where depth is unknown."""

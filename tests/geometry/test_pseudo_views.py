@@ -96,6 +96,15 @@ def test_a_surface_seen_at_a_grazing_angle_is_known_and_in_its_place():
     assert known > 0.97 * shown, (known, shown)
 
 
+def test_reduced_depth_is_that_in_the_middle_of_a_block_and_of_the_nearer_surface_at_an_edge():
+    x = torch.arange(24).expand(24, 24)
+    for factor in (2, 3, 4):
+        depth = depth_of(Photo(planes.camera(0, 24, 24), torch.zeros(24, 24, 3)), 4 + 0.02 * x).reduced(factor).depth
+        assert torch.allclose(depth[0], 4 + 0.02 * (factor * torch.arange(24 // factor) + (factor - 1) / 2))
+    edge = depth_of(Photo(planes.camera(0, 24, 24), torch.zeros(24, 24, 3)), torch.where(x < 13, 4.0, 8.0)).reduced(2)
+    assert set(edge.depth.unique().tolist()) == {4.0, 8.0}
+
+
 def test_without_two_photos_with_depth_there_are_none_and_large_ones_are_reduced():
     photos = plane(2)
     one = {"0.png": depth_of(photos["0.png"], DEPTH), "1.png": depth_of(photos["1.png"], torch.nan)}
