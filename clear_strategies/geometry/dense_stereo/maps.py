@@ -12,6 +12,7 @@ from torch import Tensor
 
 from clear_strategies.core.progress import told
 from clear_strategies.core.view import DepthMap, Photo
+from clear_strategies.geometry.dense_stereo.cloud import points_of
 from clear_strategies.geometry.dense_stereo.consistency import Estimate, confirm, speckles
 from clear_strategies.geometry.dense_stereo.cost import Grey, cost_volume, grey
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
@@ -42,7 +43,8 @@ def depth_maps(
     Args:
         photos: posed, of any sizes, on one device. Pixels that their masks hide get no depth.
         points: of the surfaces, world units: they give the range of depth, and the result is checked against them. If empty,
-            the cameras give the range. None: features are triangulated if OpenCV, kornia and SciPy are installed.
+            the cameras give a range, and the depth found there a better one. None: features are triangulated if OpenCV, kornia
+            and SciPy are installed.
         background: the colour of pixels without a surface, RGB in [0, 1].
 
     Returns:
@@ -51,7 +53,15 @@ def depth_maps(
     settings = settings or StereoSettings()
     if points is None:
         points = features_of(photos).means
-    points = points.cpu()
+    maps = _maps(photos, points.cpu(), settings, background)
+    if len(points) or not len(found := points_of(photos, maps, settings.spacing, settings.tolerance)[0]):
+        return maps
+    return _maps(photos, found, settings, background)
+
+
+def _maps(
+    photos: Sequence[Photo], points: Float[Tensor, "N 3"], settings: StereoSettings, background: Color | None
+) -> list[DepthMap]:
     compared = comparisons(photos, points, max(_CONFIRMING, settings.sources))
     estimates = _estimates(photos, compared, settings)
     needed = settings.agreeing or (2 if len(photos) >= _MANY_PHOTOS else 1)

@@ -89,6 +89,14 @@ def test_depth_of_a_known_surface_is_found_from_the_cameras_alone(surface: Surfa
         assert (error < 0.03).float().mean() > 0.97
 
 
+def test_depth_in_a_range_that_the_cameras_give_is_as_exact_as_in_that_of_points() -> None:
+    photos = plane_photos(4)
+    without, given = (depth_maps(photos, points) for points in (NONE, torch.tensor([[0.6, 0.0, 4.0]]).expand(20, 3)))
+    for guessed, known in zip(without, given, strict=True):
+        assert guessed.coverage == pytest.approx(known.coverage, abs=0.02)
+        assert (guessed.depth[guessed.known] - 4).abs().mean() < 0.02
+
+
 def test_a_few_points_choose_the_photos_that_all_points_would_choose(monkeypatch: pytest.MonkeyPatch) -> None:
     ring = [Photo(camera(0.05 * i, 0.7 * i), torch.zeros(48, 64, 3)) for i in range(-20, 20)]
     points = torch.rand(5_000, 3) * torch.tensor((4.0, 2.0, 1.0)) + torch.tensor((-2.0, -1.0, 4.0))
