@@ -144,7 +144,7 @@ class _Job:
         rates = scaled(settings.optim, stretch).of_run(settings.fit.iterations)
         return TrainState.start(
             there, self.conductor, settings=scaled(settings.fit, stretch), density=scaled(settings.density, stretch),
-            rates=rates, mip=scaled(settings.mip, stretch), rules=ready.rules,
+            rates=rates, mip=scaled(settings.mip, stretch), rules=ready.rules, rasterizer=ready.rasterizer,
         )  # fmt: skip
 
     def _announce(

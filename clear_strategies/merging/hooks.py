@@ -46,7 +46,7 @@ from clear_strategies.strategies.base import (
     unused,
 )
 from rasterizers.guards import iteration
-from rasterizers.interface import Camera, Color, Splats
+from rasterizers.interface import Camera, Color, Rasterizer, Splats
 from rasterizers.modes import apart_from_the_loop
 
 _log = logging.getLogger(__name__)
@@ -106,17 +106,18 @@ class Hooks:
     @apart_from_the_loop
     def on_fit_start(
         self, n_views: int, seed: int, device: torch.device | str = "cpu", views: Sequence[View] = (),
-        splats: Callable[[Mapping[str, Tensor]], Splats] | None = None,
+        splats: Callable[[Mapping[str, Tensor]], Splats] | None = None, rasterizer: Rasterizer | None = None,
     ) -> None:  # fmt: skip
         """Once, before the first iteration.
 
         Args:
             device: of the field. views: all training views, where the caller has them.
-            splats: see `Strategy.splats`; None: exp and sigmoid.
+            splats: see `Strategy.splats`; None: exp and sigmoid. rasterizer: see `Strategy.rasterizer`.
         """
         self.work_log.device, self.views, self.logs = torch.device(device), tuple(views), IterationLogs(self.strategies)
         # Arithmetic with numpy's numbers overflows.
-        self.run = RunFacts(self.work_log.device, int(seed), self.objective.lambda_hr, splats or by_exp_and_sigmoid)
+        λ = self.objective.lambda_hr
+        self.run = RunFacts(self.work_log.device, int(seed), λ, splats or by_exp_and_sigmoid, rasterizer)
         for s in self.strategies:
             begin(s, self.run, n_views)
             if overrides(s, "on_views"):

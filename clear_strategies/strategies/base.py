@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+import rasterizers
 from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.deferred import Deferred, Number
 from clear_strategies.core.evidence import Evidence, PatchMaps
@@ -27,11 +28,22 @@ from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.errors import AnswerError
 from clear_strategies.kernels import reconcile
 from clear_strategies.signatures import annotations_of
-from rasterizers.interface import Camera, Color, Splats
+from rasterizers.interface import Camera, Color, Rasterizer, Splats
 from rasterizers.native import empty_for
 
 _ALIKE: Final = 0.85  # "regularise" to "regularize" 0.9, "densify" to "densifier" 0.75
-_OWN_NAMES: Final = {"state", "run_state", "cache", "logs", "of_run", "device", "seed", "lambda_hr", "splats"}
+_OWN_NAMES: Final = {
+    "state",
+    "run_state",
+    "cache",
+    "logs",
+    "of_run",
+    "device",
+    "seed",
+    "lambda_hr",
+    "splats",
+    "rasterizer",
+}
 
 ONE_ANSWER: Final = ("densifier", "background", "gate", "observe", "route", "reconcile", "score")
 """Hooks that one strategy of a run may override; `correct` may be overridden in place of `reconcile`."""
@@ -60,12 +72,14 @@ class RunFacts:
     Args:
         seed: None before the run starts.
         lambda_hr: the schedule of the run's objective. splats: activates raw parameters as the run draws them.
+        rasterizer: of the run; None: the trainer does not tell it.
     """
 
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     seed: int | None = None
     lambda_hr: Callable[[int], float] = _no_weight
     splats: Callable[[Mapping[str, Tensor]], Splats] = by_exp_and_sigmoid
+    rasterizer: Rasterizer | None = None
 
 
 @dataclass(frozen=True)
@@ -319,6 +333,15 @@ class Strategy:
         In this trainer, the 3D filter is applied; filters of other trainers are left out.
         """
         return self.of_run.splats(params)
+
+    @property
+    def rasterizer(self) -> Rasterizer:
+        """What draws the run, for a strategy that renders by itself. In other trainers, it is not their own function, but the
+        fastest rasterizer of this package, with its defaults.
+        """
+        if self.of_run.rasterizer is None:
+            self.of_run.rasterizer = rasterizers.load(rasterizers.fastest(self.device))
+        return self.of_run.rasterizer
 
     @property
     def seed(self) -> int:

@@ -30,7 +30,7 @@ from clear_strategies.training.history import History
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
 from clear_strategies.training.settings import FitSettings
-from rasterizers.interface import RasterSettings, Splats
+from rasterizers.interface import Rasterizer, RasterSettings, Splats
 from rasterizers.replays import Replays
 
 _log = logging.getLogger(__name__)
@@ -106,13 +106,14 @@ class TrainState:
         rates: LearningRates,
         mip: MipFilter,
         rules: RasterSettings = _RULES,
+        rasterizer: Rasterizer | None = None,
     ) -> TrainState:
         """The state before the first iteration, on the device of the scene's views.
 
         Args:
             settings, density, rates, mip: with milestones already scaled to this run.
             density: of the densifier, unless a strategy brings its own.
-            rules: of the rasterizer that draws.
+            rules: of the rasterizer that draws. rasterizer: itself, for strategies that draw.
         """
         device = scene.device
         theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree).to(device)
@@ -130,7 +131,7 @@ class TrainState:
         def splats(raw: Mapping[str, Tensor]) -> Splats:
             return state.field.splats_of(raw)  # a checkpoint brings another field
 
-        conductor.on_fit_start(len(scene.train), settings.seed, device, scene.train, splats=splats)
+        conductor.on_fit_start(len(scene.train), settings.seed, device, scene.train, splats, rasterizer)
         state.compiled_step = compiled_step_for(conductor, optimizer, settings.fused)
         state.refilter()
         return state

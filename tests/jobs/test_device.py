@@ -6,12 +6,14 @@ from pathlib import Path
 import pytest
 import torch
 
+from clear_strategies import Strategy
 from clear_strategies.compose import tree
 from clear_strategies.errors import SettingError
-from clear_strategies.jobs import device
+from clear_strategies.jobs import device, job
 from clear_strategies.jobs.device import RasterizerSettings, drawn_on
 from clear_strategies.jobs.settings import JobSettings, settings_of
 from rasterizers.reference import ReferenceRasterizer
+from tests.helpers.command_line import TINY
 from tests.helpers.configs import composed
 
 
@@ -20,6 +22,14 @@ class Theirs(ReferenceRasterizer):
     """A third party's rasterizer, with a setting of its own."""
 
     sharpness: float = 1.0
+
+
+@dataclass(frozen=True)
+class Draws(Strategy):
+    """Logs by which kernel it would draw."""
+
+    def regularize(self, params, t):
+        self.log("kernel", self.rasterizer.kernel)
 
 
 def settings(*overrides: str) -> JobSettings:
@@ -81,3 +91,10 @@ def test_a_rasterizer_of_another_package_is_a_target_with_the_same_settings():
         device.load_rasterizer(settings(target, "rasterizer.kernel=-1").rasterizer, None)
     with pytest.raises(SettingError, match="rasterizer: Path is no Rasterizer"):
         device.load_rasterizer(device.functools.partial(Path), None)
+
+
+def test_a_strategy_draws_by_the_rasterizer_of_the_run(tmp_path: Path):
+    words = [*TINY, f"+strategies.x._target_={__name__}.Draws", "rasterizer.kernel=0.25", "fit.iterations=1"]
+    job.run(composed(*words, "prior=bicubic", "fit.threads=1"), tmp_path)
+    names, row = ((tmp_path / "history.csv").read_text().splitlines()[i].split(",") for i in (0, 1))
+    assert row[names.index("kernel")] == "0.25"
