@@ -7,12 +7,13 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import ParamSpec, TypeVar
+from typing import Final, ParamSpec, TypeVar
 
 import torch
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+_NO_AUTOGRAD: Final = "Autograd is off here: compute under torch.enable_grad(), from x.detach().requires_grad_()."
 
 
 def in_full_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -32,8 +33,22 @@ def in_full_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def apart_from_the_loop(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """The function with torch's autocast and autograd off, so that it runs in the same modes in each loop and stores no graph."""
-    return in_full_precision(torch.no_grad()(function))
+    """The function with torch's autocast and autograd off, so that it runs in the same modes in each loop and stores no graph.
+
+    If code that it calls, such as a strategy's, needs autograd, the error says how to turn it on.
+    """
+    apart = in_full_precision(torch.no_grad()(function))
+
+    @functools.wraps(function)
+    def called(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        try:
+            return apart(*args, **kwargs)
+        except RuntimeError as error:
+            if "does not require grad" in str(error) and not hasattr(error, "__notes__"):
+                error.add_note(_NO_AUTOGRAD)
+            raise
+
+    return called
 
 
 def on_cpu_by_default(function: Callable[_P, _R]) -> Callable[_P, _R]:

@@ -857,6 +857,16 @@ def test_comparisons_change_the_image_and_add_losses_each_around_the_next(drawn)
         assert not torch.equal(found.grads["means"], darker.grads["means"])
 
 
+def test_an_error_for_want_of_autograd_says_how_to_turn_it_on(drawn):
+    def regularize(params, t):
+        return {"scales": torch.autograd.grad(params["scales"].exp().sum(), params["scales"])[0]}
+
+    with pytest.raises(RuntimeError, match="does not require grad") as told:
+        updated(drawn, answering("regularize", regularize)())
+    (note,) = told.value.__notes__
+    assert "compute under torch.enable_grad()" in note
+
+
 def test_cotangents_that_a_strategy_stores_are_its_own(drawn):
     field, view, lr, hr = drawn
     stored = []
