@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import torch
@@ -38,8 +38,11 @@ class StubShot:
     means2d: Float[Tensor, "N 2"]
     visible: Bool[Tensor, " N"]
     gradients: list[Grads]
+    cotangents: list[Tensor] = field(default_factory=list)
+    """That it was given, which do not change its gradients."""
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None) -> list[Grads]:
+        self.cotangents.append(cotangents.clone())
         each = self.gradients[: len(cotangents)]
         return each if weight is None else summed(each, weight)
 
@@ -126,6 +129,7 @@ def trace(conductor: Conductor, start: int, stop: int, n: int = N) -> Iterator[A
         yield torch.tensor(conductor.background(t) or (0.0, 0.0, 0.0))
         update = conductor.update(params, lr, hr, view, t)
         yield update.score
+        yield from (*lr.cotangents, *hr.cotangents)  # what `compare` answered
         yield from (g for _, g in sorted((update.grads or {}).items()))
         for extra in conductor.extra_views(t):
             yield from (extra.photo.image, extra.weight)

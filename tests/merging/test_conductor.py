@@ -137,6 +137,15 @@ class Secretive(Strategy):
 
 
 @dataclass(frozen=True)
+class SecretGain(Strategy):
+    """Learns a gain of the image outside `run_state`."""
+
+    def compare(self, scale, image, photo, step, losses):
+        gain = self.cache["gain"] = self.cache.get("gain", 1.0) * 0.9
+        return losses(image * gain)
+
+
+@dataclass(frozen=True)
 class Fixed(Strategy):
     """Has a row for each Gaussian where they do not follow."""
 
@@ -180,6 +189,7 @@ class OfFunctions(Strategy):
         (answering("observe", lambda step, hr: Evidence(step.visible / step.visible, step.visible.float())),
          "the evidence of reliability is not finite"),
         (answering("gate", lambda t, n: (torch.rand(n) > 0.5).float()), "derive randomness"), (Secretive, "does not continue"),
+        (SecretGain, "does not continue"),
         (answering("after_step", lambda p, step: step.visible.float()), "after_step fails in an iteration without HR"),
         (answering("on_views", lambda views: views[0].lr, gate=NO_GATE), "on_views fails where there are no views yet"),
         (Fixed, r"Fixed.reconcile\(\) must give .* \[37\]"),
