@@ -54,8 +54,8 @@ def asked() -> bool:
 
 @contextmanager
 def deferred_signals() -> Iterator[list[int]]:
-    """Collect the first of `STOPS` instead of stopping in the middle of a step; after it SIGINT and SIGTERM act at once. SIGHUP
-    is not collected where it is ignored, as under nohup.
+    """Collect the first of `STOPS` instead of stopping in the middle of a step; after it SIGINT and SIGTERM act at once. What is
+    ignored stays so: SIGHUP under nohup, and SIGINT of a job that a script starts with `&`.
 
     SIGUSR1 and SIGUSR2 are collected where they have a handler (one that resubmits the job, say), since that handler
     would exit before anything is saved. All handlers are restored when `fit` raises Interrupted, so that the caller can
@@ -67,12 +67,12 @@ def deferred_signals() -> Iterator[list[int]]:
         pending.append(signum)
         again = " Once more to leave at once." if signum in TWICE else ""
         _log.warning("%s: finishing this step, then saving.%s", signal.Signals(signum).name, again)
-        for s in TWICE:
+        for s in before.keys() & {*TWICE}:
             signal.signal(s, before[s])
 
     handled = [s for s in _ANNOUNCEMENTS if callable(signal.getsignal(s))]
-    handled += [s for s in _HANGUPS if signal.getsignal(s) is not signal.SIG_IGN]
-    with _handled((*TWICE, *handled), note) as before:
+    handled += [s for s in STOPS if signal.getsignal(s) is not signal.SIG_IGN]
+    with _handled(handled, note) as before:
         if before:
             _collected.append(pending)
         try:
@@ -112,7 +112,7 @@ def _handled(signals: Iterable[int], handler: Handler) -> Iterator[Mapping[int, 
 
 
 def handle(handler: Handler) -> None:
-    """Set a handler of `STOPS`; SIGHUP stays ignored where it is."""
+    """Set a handler of `STOPS`; those that are ignored stay so."""
     for signum in STOPS:
         if signal.getsignal(signum) is not signal.SIG_IGN:
             signal.signal(signum, handler)

@@ -64,9 +64,10 @@ def test_a_signal_that_ends_a_run_saves_before(signals, tmp_path):
     assert len(list((tmp_path / "cut/checkpoints").iterdir())) == 1
 
 
-def test_a_run_under_nohup_goes_on_after_its_terminal_is_closed(tmp_path):
-    said, nohup = tmp_path / "said", "import signal\nsignal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
-    ended = started("-c", nohup + stopped_by(signal.SIGHUP, after=5), *SAVING, cwd=tmp_path, said=said).wait()
+@pytest.mark.parametrize("ignored", [signal.SIGHUP, signal.SIGINT], ids=["nohup", "a job that a script starts with &"])
+def test_a_run_goes_on_after_a_signal_that_it_was_started_to_ignore(ignored, tmp_path):
+    said, shell = tmp_path / "said", f"import signal\nsignal.signal({int(ignored)}, signal.SIG_IGN)\n"
+    ended = started("-c", shell + stopped_by(ignored, after=5), *SAVING, cwd=tmp_path, said=said).wait()
     assert (ended, (tmp_path / "cut/metrics.json").is_file()) == (0, True), said.read_text()
 
 
