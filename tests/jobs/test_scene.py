@@ -5,6 +5,7 @@ import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
+from statistics import median
 
 import pytest
 import torch
@@ -220,8 +221,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory):
 @pytest.mark.parametrize("scale", [1e-5, 1e5])
 def test_a_scene_in_other_units_gives_equal_results(scale: float, trained) -> None:
     score, folder, said = trained(scale)
-    # Rounding alone moves 60 iterations by up to 0.3 dB (a scale of 100, with AVX2); a length in wrong units by several.
-    assert score == pytest.approx(trained(1.0)[0], abs=0.4)
+    # By rounding alone, the scores of 21 scales from 1e-5 to 1e5 deviate by 0.13 dB; a length in wrong units costs several.
+    assert score == pytest.approx(median(trained(near)[0] for near in (0.7, 1.0, 1.3)), abs=0.4)
     assert "warning: " not in said
     for saved in (folder, folder / "point_cloud.ply"):
         splat = open_splat(saved)
