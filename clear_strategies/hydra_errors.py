@@ -164,5 +164,10 @@ def _similar(key: str, known: Sequence[str]) -> list[str]:
     fit.viewer for viewer.
     """
     begin_so = [other for other in known if other.startswith(key) and "." not in other[len(key) :]]
-    alike = begin_so or difflib.get_close_matches(key, known, 1, 0.8)
-    return alike or [other for other in known if other.rpartition(".")[2] == key.rpartition(".")[2]]
+    name = key.rpartition(".")[2]
+    spelled_so = [  # strategies.mine.hr is like strategies.mine.weight only by what both begin with
+        other
+        for other in difflib.get_close_matches(key, known, 1, 0.8)
+        if difflib.SequenceMatcher(None, other.rpartition(".")[2], name).ratio() >= 0.5
+    ]
+    return begin_so or spelled_so or [other for other in known if other.rpartition(".")[2] == name]
