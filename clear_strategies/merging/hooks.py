@@ -33,6 +33,7 @@ from clear_strategies.strategies.answers import (
     require_not_negative,
     require_stored,
     rows_like,
+    unchanged,
 )
 from clear_strategies.strategies.base import (
     ONE_ANSWER,
@@ -272,7 +273,8 @@ class Hooks:
         """
         total, self._pulled_at = Grads(), None
         for s in self.regularizers:
-            answer = s.regularize(in_our_shapes(params), iteration(t))
+            with unchanged(s, "regularize", params, "return a gradient, or change it in after_step()"):
+                answer = s.regularize(in_our_shapes(params), iteration(t))
             if answer is None:
                 self.work_log.skip("regularize", "it adds nothing yet")
                 continue
@@ -398,7 +400,8 @@ def _compared(
         inner.append(losses(image))
         return inner[0]
 
-    found = s.compare(scale, image, photo, step, noted)
+    with unchanged(s, "compare", {"the image": image}, "it is the rendering; change a copy, image.clone()"):
+        found = s.compare(scale, image, photo, step, noted)
     if not inner or not isinstance(found, Losses):
         refuse(s, "compare", "the Losses that losses(image) returns, or these with changes", found)
     shape = inner[0].cotangents.shape

@@ -6,7 +6,8 @@ Numbers are checked in the CPU's memory only; to read those of a device, the hos
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, NoReturn
 
 import torch
@@ -19,6 +20,7 @@ from clear_strategies.core.gradients import Grads, in_our_shapes
 from clear_strategies.core.step import Losses
 from clear_strategies.errors import AnswerError
 from clear_strategies.strategies.base import Scale, Strategy
+from rasterizers.torch_internals import version
 
 
 def require_stored(s: Strategy, params: Mapping[str, Tensor]) -> None:
@@ -53,6 +55,15 @@ def require_stored(s: Strategy, params: Mapping[str, Tensor]) -> None:
                     "of other rows (expand), which changes with it. Store its clone()."
                 )
             taken.add(address)
+
+
+@contextmanager
+def unchanged(s: Strategy, hook: str, shown: Mapping[str, Tensor], remedy: str) -> Iterator[None]:
+    """A scope in which a hook may write to none of the tensors that it is shown."""
+    before = {name: version(x) for name, x in shown.items()}
+    yield
+    if written := [name for name, x in shown.items() if version(x) != before[name]]:
+        raise AnswerError(f"{_named(s, hook)} must not change {written[0]} in place: {remedy}.")
 
 
 def require_finite(s: Strategy, hook: str, numbers: Mapping[str, float | Tensor]) -> None:
