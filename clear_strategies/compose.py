@@ -51,17 +51,19 @@ class ConductorSettings:
     decorators: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
     statistics_from: int | None = signature(Conductor).parameters["statistics_from"].default
 
-    def conductor(self, stretch: float, detail: DetailRates | None = None) -> Conductor:
+    def conductor(self, stretch: float, detail: DetailRates | None = None, own: Sequence[Strategy] = ()) -> Conductor:
         """The conductor of a run, its milestones times `stretch`.
 
         Args:
             detail: for hosts; this package's trainer has the rates of f_det among its own (`optim`).
+            own: further strategies, used as they are.
 
         Raises:
             StrategyConflict: two strategies answer a question that only one may.
         """
         return Conductor(
             *(scaled(strategy, stretch) for strategy in self.strategies.values()),
+            *own,
             objective=scaled(self.objective, stretch),
             skips=scaled(self.skips, stretch),
             statistics_from=None if self.statistics_from is None else round(self.statistics_from * stretch),
@@ -71,7 +73,7 @@ class ConductorSettings:
 
 
 def conductor(
-    strategy: str | Sequence[str] = "clear", *overrides: str, iterations: int = REFERENCE_ITERATIONS
+    strategy: str | Sequence[str] = "clear", *more: str | Strategy, iterations: int = REFERENCE_ITERATIONS
 ) -> Conductor:
     """The strategies of conf/, with their objective and `skips=hosts`, for a host's loop.
 
@@ -79,8 +81,9 @@ def conductor(
 
     Args:
         strategy: as after `+strategy=`: "clear", "gco", "gco,svs", "[gco,svs]", "baseline" …, or a list, ["gco", "svs"].
-        overrides: as on the command line of `run`: "strategies.gco.tolerance=0.1", "objective=paper", "~strategies.p2g".
-        iterations: of the host; every milestone stretches from 10,000 to it.
+        more: overrides, as on the command line of `run`: "strategies.gco.tolerance=0.1", "objective=paper", "~strategies.p2g";
+            and strategies of your own, whose milestones are iterations of the host.
+        iterations: of the host; every other milestone stretches from 10,000 to it.
 
     Raises:
         SettingError: no strategy or field has that name, or a value is outside its range; the message names it.
@@ -90,6 +93,8 @@ def conductor(
         raise SettingError(f"iterations must be at least 1, got {iterations}.")
     names = strategy.strip() if isinstance(strategy, str) else f"[{','.join(map(str, strategy))}]"
     chosen = f"+strategy=[{names}]" if "," in names and not names.startswith("[") else f"+strategy={names}"
+    own = [s for s in more if isinstance(s, Strategy)]
+    overrides: Any = [word for word in more if not isinstance(word, Strategy)]  # text, as `composed` requires
     config = composed((chosen, *overrides))
     content = tree(config, _TRAINERS)
     for part, reason in _NOT_IN_HOSTS.items():
@@ -97,7 +102,7 @@ def conductor(
         if not is_named and content["strategies"].pop(part, None) is not None:
             _say_left_out(part, reason)
     settings: ConductorSettings = build(content)
-    return settings.conductor(iterations / REFERENCE_ITERATIONS, _detail(config).of_run(iterations))
+    return settings.conductor(iterations / REFERENCE_ITERATIONS, _detail(config).of_run(iterations), own)
 
 
 # Parts of `best`. Without `mcmc`, random backgrounds gain nothing on fern and horns, and cost 0.4 dB on the demo.

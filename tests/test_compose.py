@@ -20,6 +20,7 @@ from clear_strategies.hydra_errors import not_composed
 from clear_strategies.jobs.settings import settings_of
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.options import CONF, _ConfSource
+from clear_strategies.schedules import Ramp
 from clear_strategies.training.settings import FitSettings
 from rasterizers.geometry import SH_C0
 from tests.helpers import command_line
@@ -42,6 +43,9 @@ def test_names_and_overrides_are_those_of_the_command_line_and_milestones_stretc
     c = conductor("gco", "strategies.gco.tolerance=0.2", "objective=lr_only")
     assert c.strategies[0].tolerance == 0.2
     assert c.objective.lambda_hr(5_000) == 0
+    own = SVS(dropout=Ramp(0.3))
+    c = conductor("clear", "~strategies.svs", own, iterations=30_000)
+    assert (names(c), c.strategies[-1] is own) == (["GCO", "P2G", "SVS"], True)
     c = conductor("clear", iterations=30_000)
     assert c.strategies[2].anchor_start == 15_000
     assert (c.objective.lambda_hr.start, c.objective.lambda_hr.full) == (1_500, 9_000)
