@@ -222,6 +222,7 @@ NOT_MAPPED = "x.so: failed to map segment from shared object"
 ENDINGS = {
     KeyboardInterrupt(): (130, "stopped by SIGINT."),  # a job says what it has saved
     KeyboardInterrupt(signal.SIGTERM): (143, "stopped by SIGTERM."),
+    RuntimeError("Job 7\nhas not produced any output (state: FAILED)"): (2, "a job of the sweep was ended, as by scancel."),
     RuntimeError('Could not detect "srun", are you indeed'): (2, "hydra/launcher: there is no Slurm on this machine"),
     OSError(errno.ENOSPC, "No space", "x"): (3, "x: No space. Free space, or write elsewhere (hydra.run.dir=FOLDER"),
     OSError(errno.EROFS, "Read-only", "x"): (3, "x: Read-only. Write elsewhere (hydra.run.dir=FOLDER of a run, hydra."),

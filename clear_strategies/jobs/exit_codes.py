@@ -16,6 +16,7 @@ from clear_strategies.errors import ClearError, SettingError, one_line
 
 _NO_MEMORY: Final = "can't allocate memory"  # of torch's allocator on the CPU
 _NO_SLURM: Final = 'Could not detect "srun"'  # of submitit
+_JOB_ENDED: Final = "has not produced any output"  # of submitit, where Slurm has ended a job without SIGUSR2
 _LESS_MEMORY: Final = (
     "Raise `ulimit -v` where it is set. Lower density.max_gaussians or raise data.views.shrink; rasterizer.memory bounds the "
     "rasterizer's lists. Of clear-strategies render: lower --width."
@@ -75,10 +76,15 @@ def describe(error: BaseException) -> Ending | None:
 
 
 def _of_machine(error: BaseException) -> str | None:
-    """The message if the machine has no Slurm, or if memory ran out, or may have; None for other errors."""
+    """The message if the machine has no Slurm or has ended a job, or if memory ran out, or may have; None for other errors."""
     if isinstance(error, RuntimeError) and _NO_SLURM in str(error):
         return (
             "hydra/launcher: there is no Slurm on this machine (no srun). Start the command on a node of its cluster."
+        )
+    if isinstance(error, RuntimeError) and _JOB_ENDED in str(error):
+        return (
+            "a job of the sweep was ended, as by scancel. Finished jobs stay; the others go on from their checkpoints with "
+            "fit.resume=auto and the same hydra.sweep.dir."
         )
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY in str(error)):
         return f"out of memory: {one_line(error) or 'Python had none left.'} {_LESS_MEMORY}"
