@@ -109,18 +109,24 @@ def test_sources_are_drawn_as_often_as_their_weights_say():
 def test_dead_gaussians_move_to_live_ones_and_start_without_momentum():
     theta, optimizer, densifier = start_of_run(growth=0.0)
     theta.opacities.data[:20] = DEAD
-    means = theta.means.data.clone()
+    means, scales = theta.means.data.clone(), theta.scales.data.clone()
     parents = step(theta, optimizer, densifier)
     assert len(theta) == N
     assert bool((parents[:20] >= 20).all())
     assert torch.equal(parents[20:], torch.arange(20, N))
     assert torch.equal(theta.means.data, means[parents])
-    shared = torch.bincount(parents, minlength=N)[parents] > 1
+    copies = torch.bincount(parents, minlength=N)[parents]
+    shared = copies > 1
+    _, smaller = relocation(torch.full((N,), 0.5), scales[parents].exp(), copies)
+    assert torch.allclose(theta.scales.data, smaller.log())
     for moments in (*optimizer.first.values(), *optimizer.second.values()):
         assert not bool(moments[shared].any())
         assert bool((moments[~shared] == 1).all())
     assert bool((theta.opacities.data[shared] < 0).all())
     assert bool((theta.opacities.data[~shared] == 0).all())
+    theta, optimizer, densifier = start_of_run(opacity=40.0)  # 1 in float32
+    step(theta, optimizer, densifier)
+    assert bool(theta.opacities.data.isfinite().all())
 
 
 def test_rounds_fall_between_start_and_stop_and_the_field_grows_to_a_multiple_of_its_points():

@@ -109,6 +109,18 @@ def test_split_children_lie_inside_their_parent_clones_are_copies_and_the_score_
     parents = density.restructure(field, optimizer, 10)
     assert torch.bincount(parents, minlength=12)[5:8].tolist() == [2, 2, 2]
     assert len(parents) == 15
+    density.settings = replace(density.settings, reduce="max")  # of largest values there is no mean
+    density.count[:], density.score[:4], density.ordinary[:4] = 1e6, 1.0, 1.0
+    assert len(density.restructure(field, optimizer, 20)) == 19
+
+
+def test_what_is_small_in_a_large_scene_is_cloned():
+    for extent, parents in ((1.0, [1, 0, 0]), (10.0, [0, 1, 0])):
+        field, optimizer, density = tagged(2)
+        field.scales.data[:] = math.log(0.05)
+        density.score[0] = density.ordinary[0] = density.count[0] = 1.0
+        density.extent = extent
+        assert density.restructure(field, optimizer, 10).tolist() == parents
 
 
 def test_split_children_lie_along_the_long_axis_of_their_parent():
@@ -126,10 +138,12 @@ def test_split_children_lie_along_the_long_axis_of_their_parent():
 def test_the_cap_binds_and_is_said(caplog):
     field, optimizer, _ = tagged()
     density = toy.densifier(DensitySettings(start=0, stop=100, max_gaussians=14), field)
-    density.score[:] = density.ordinary[:] = torch.arange(12) + 1.0
-    density.count[:] = 1
-    assert len(density.restructure(field, optimizer, 10)) == 14
-    assert "the limit of 14 Gaussians is reached: 12 are to be cloned or split, and there is room for 2" in caplog.text
+    for _ in range(2):
+        density.score[:] = density.ordinary[:] = torch.arange(len(field)) + 1.0
+        density.count[:] = 1
+        assert len(density.restructure(field, optimizer, 10)) == 14
+    (said,) = (r.getMessage() for r in caplog.records if "limit" in r.getMessage())
+    assert "the limit of 14 Gaussians is reached: 12 are to be cloned or split, and there is room for 2" in said
 
 
 def test_statistics_are_means_over_the_views_that_saw_a_gaussian_and_at_least_ten_rounds_fit():

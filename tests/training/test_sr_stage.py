@@ -46,8 +46,10 @@ def test_an_opaque_gaussian_becomes_six_thinner_ones_once_and_the_cap_leaves_the
     density, parents = toy.densifier(settings, theta), []
     density.step(theta, optimizer, 12, parents.append)  # skips may jump over t=10
     assert parents[0].tolist() == [0, 1, *[2, 3] * 6]
+    density.score[3] = 7
     resumed = toy.densifier(settings, theta)
     resumed.load_state_dict(density.state_dict())
+    assert torch.equal(resumed.score, density.score)
     assert not resumed.step(theta, optimizer, 13, parents.append)
 
 
