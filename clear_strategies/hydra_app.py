@@ -159,7 +159,8 @@ def _job(config: DictConfig, folder: Path) -> float | None:
 
         def claim() -> None:
             log()
-            (folder / FAILED).unlink(missing_ok=True)
+            for note in (folder / FAILED, _beside(folder)):  # of an earlier sweep
+                note.unlink(missing_ok=True)
             written = {"config": config, "hydra": HydraConfig.instance().cfg, "overrides": overrides}
             for name, content in written.items():
                 files.write_text(folder / ".hydra" / f"{name}.yaml", OmegaConf.to_yaml(content))
@@ -192,7 +193,7 @@ def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resum
         from clear_strategies.jobs import resume
 
         finished = resume.begun(folder) == "results"  # its folder stays as it is
-        note = folder.with_name(f"{folder.name}_{FAILED}") if finished else folder / FAILED
+        note = _beside(folder) if finished else folder / FAILED
         text = f"job {HydraConfig.get().job.num}: {message}\n"
         files.write_text(note, text.encode(errors="backslashreplace").decode())  # a file's name may not be Unicode
         return
@@ -205,16 +206,35 @@ def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resum
     sys.exit(code)
 
 
+def _beside(folder: Path) -> Path:
+    """The note of a failed job whose folder holds a finished run."""
+    return folder.with_name(f"{folder.name}_{FAILED}")
+
+
+def _notes(folder: Path) -> dict[Path, int]:
+    """The notes of failed jobs in the folder of sweeps, and when each was written, ns."""
+    written = dict[Path, int]()
+    for note in folder.rglob(f"*{FAILED}"):
+        with suppress(FileNotFoundError):  # another sweep in this folder has just begun this job
+            written[note] = note.stat().st_mtime_ns
+    return written
+
+
 class SweepCallback(Callback):
-    """Runs at the beginning and end of a sweep, in the process that was started; jobs may run in other processes."""
+    """Runs at the beginning and end of a sweep, in the process that was started; jobs may run in other processes.
+
+    Several sweeps may have one folder: the notes of jobs that failed in an earlier one stay there.
+    """
+
+    def __init__(self) -> None:
+        self._earlier = dict[Path, int]()
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         if refusal := sweep.leave_out_what_methods_set_aside(config) or sweep.refusal(config):
             _log.error("%s", refusal)  # of an error that a callback raises Hydra makes a warning
             sys.exit(exit_codes.UNUSABLE)
         signals.handle(sweep.stop_workers)
-        for note in Path(config.hydra.sweep.dir).rglob(f"*{FAILED}"):  # of an earlier sweep
-            note.unlink()
+        self._earlier = _notes(Path(config.hydra.sweep.dir))
         sweep.name_by_all_that_is_swept(config)
         _begun.append(config.hydra.sweep.dir)
 
@@ -224,7 +244,9 @@ class SweepCallback(Callback):
         folder = Path(config.hydra.sweep.dir)
         _report(folder)
         failed = defaultdict[str, list[int]](list)
-        for note in folder.rglob(f"*{FAILED}"):
+        for note, written in _notes(folder).items():
+            if self._earlier.get(note) == written:
+                continue
             job, message = note.read_text(encoding="utf-8").strip().split(": ", 1)
             failed[message].append(int(job.removeprefix("job ")))
         if failed:

@@ -370,6 +370,22 @@ def test_a_clusters_announcement_saves_before_its_handler_acts(tmp_path):
     assert process.wait() == 91, (tmp_path / "said").read_text()
 
 
+def test_failed_jobs_are_told_by_their_own_sweep_and_their_notes_stay_until_the_job_begins_again(tmp_path):
+    def sweep_of(*strategies: str, iterations: str) -> tuple[int, str]:
+        words = [f"+strategy={','.join(strategies)}", *TINY, f"fit.iterations={iterations}", "fit.resume=auto"]
+        folders = ["hydra.sweep.dir=all", "hydra.sweep.subdir=${hydra.runtime.choices.strategy}"]
+        ended = run("-m", *words, *folders, cwd=tmp_path)
+        return ended.returncode, ended.stdout.splitlines()[-1]
+
+    failed = "error: 1 job failed: job 0: fit.iterations: must be a whole number of at least 1, got -1"
+    assert sweep_of("gco", iterations="-1")[1].startswith(failed)
+    (note,) = (tmp_path / "all").rglob(f"*{FAILED}")
+    code, last = sweep_of("svs", iterations="2")
+    assert (code, "failed" in last, note.is_file()) == (0, False, True), last
+    assert sweep_of("gco", iterations="-1")[1].startswith(failed)  # the same job, again
+    assert (sweep_of("gco", iterations="2")[0], note.is_file()) == (0, False)
+
+
 def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, caplog, monkeypatch):
     monkeypatch.setattr(signals, "handle", lambda _: None)  # else this process keeps the handlers of a sweep
     callback, choices = SweepCallback(), {"choices": {"hydra/sweeper": "optuna"}}
