@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies import files
 from clear_strategies.errors import SettingError, one_line
-from clear_strategies.hydra_errors import not_composed, require_option
+from clear_strategies.hydra_errors import NOT_COMPOSED, not_composed, require_option
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.objective import Objective
@@ -170,7 +170,7 @@ def composed(overrides: Sequence[str], config: str = "conductor") -> DictConfig:
     try:
         require_each_once(overrides)
         return composed_by_hydra(overrides, config)
-    except (HydraException, OmegaConfBaseException) as error:
+    except NOT_COMPOSED as error:
         raise not_composed(error, overrides, config) from error
 
 

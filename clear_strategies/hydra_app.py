@@ -30,12 +30,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies import console, files, signals
 from clear_strategies.compose import quoted, require_each_once
 from clear_strategies.errors import ClearError, SettingError, counted, one_line
-from clear_strategies.hydra_errors import WRITTEN, not_composed, require_option
+from clear_strategies.hydra_errors import NOT_COMPOSED, WRITTEN, not_composed, require_option
 from clear_strategies.jobs import exit_codes, sweep
 from clear_strategies.options import CONF
 
@@ -88,7 +87,7 @@ def main(overrides: Sequence[str] | None = None) -> None:
     _begun.clear()
     try:
         _run_hydra(options, parser, job, str(CONF), "config")
-    except (HydraException, OmegaConfBaseException) as error:
+    except NOT_COMPOSED as error:
         overrides = [word for word in options.overrides if not word.startswith("hydra.")]
         raise not_composed(error, overrides, "config") from error
     except BrokenProcessPool as error:

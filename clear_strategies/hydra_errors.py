@@ -12,11 +12,14 @@ from hydra.core.override_parser.types import ChoiceSweep, Override
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from clear_strategies.errors import SettingError, one_line
-from clear_strategies.options import CONF, composed_by_hydra, has_setting, options, sweeps
+from clear_strategies.options import CONF, composed_by_hydra, has_setting, malformed, options, sweeps
 from clear_strategies.settings import TARGET, flat, has_parameter, key_of
 
+NOT_COMPOSED: Final = (HydraException, OmegaConfBaseException, YAMLError)
+"""What composing a configuration raises where an override or a file of options is wrong."""
 WRITTEN: Final = "A setting is written name=value, and clear-strategies --cfg job prints all of them."
 # What Hydra says, and what to say in place of it. Packages hydra-NAME-launcher bring launchers.
 _IN_OUR_WORDS: Final = {
@@ -82,6 +85,8 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
         config: as of `compose.composed`.
     """
     text = one_line(error)
+    if isinstance(error, YAMLError):
+        return malformed(error)
     for theirs, ours in _IN_OUR_WORDS.items():
         if said := re.search(theirs, text):
             return SettingError(ours.format(*said.groups()))
@@ -121,7 +126,7 @@ def _composed(overrides: Sequence[str], config: str) -> dict[str, Any]:
         words = OverridesParser.create().parse_overrides(list(overrides))
         fixed = [text for text, word in zip(overrides, words, strict=True) if not word.is_sweep_override()]
         return OmegaConf.to_container(composed_by_hydra(fixed, config))  # type: ignore[return-value]
-    except (HydraException, OmegaConfBaseException):
+    except NOT_COMPOSED:
         return {}
 
 

@@ -24,8 +24,9 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
+from yaml import YAMLError
 
-from clear_strategies.errors import SettingError
+from clear_strategies.errors import SettingError, one_line
 from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, defaults_of, flat, key_of, with_defaults
 
 _PACKAGE: Final = Path(__file__).resolve().parent
@@ -95,10 +96,30 @@ def _folders() -> Iterator[Path]:
     yield from (Path(_folder_of(point)) for point in entry_points(group=OPTIONS))
 
 
-def options(group: str) -> dict[str, Mapping[str, Any]]:
-    """The content of each file in a group, by its name."""
-    files = [file for folder in _folders() for file in sorted((folder / group).glob("[!_]*.yaml"))]
-    return {file.stem: OmegaConf.to_container(OmegaConf.load(file)) for file in files}  # type: ignore[misc]
+def options(group: str, *own: Path) -> dict[str, Mapping[str, Any]]:
+    """The content of each file in a group, by its name.
+
+    Args:
+        own: further folders, as of Hydra's `--config-dir`.
+    """
+    files = [file for folder in (*_folders(), *own) for file in sorted((folder / group).glob("[!_]*.yaml"))]
+    return {file.stem: _content(file) for file in files}
+
+
+def _content(file: Path) -> dict[str, Any]:
+    """The settings of a file; a SettingError where it holds none."""
+    try:
+        content: Any = OmegaConf.to_container(OmegaConf.load(file))
+    except YAMLError as error:
+        raise malformed(error) from error
+    if not isinstance(content, dict):
+        raise SettingError(f"{file}: a file of options has lines as `name: value`, got {content!r}. Correct it.")
+    return content
+
+
+def malformed(error: YAMLError) -> SettingError:
+    """The error for a file of options that is no YAML; PyYAML's message names the file and the line."""
+    return SettingError(f"a file of options is no valid YAML: {one_line(error)}. Correct that line.")
 
 
 class _ConfSource(FileConfigSource):

@@ -134,17 +134,7 @@ def missing(key: str, *, known: bool = True) -> SettingError:
 
 def _called(node: Mapping[str, Any], key: str) -> Any:
     target = node[TARGET]
-    try:
-        function = _located(target)
-    except Exception as error:  # whatever a module does when it is imported
-        if place := _place_in_module(error):
-            cause = f"{place}: {type(error).__name__}: {one_line(error)}"
-            raise SettingError(f"{key}: {target} cannot be imported: {cause}. Correct that file.") from error
-        if not isinstance(error, ImportError | AttributeError):
-            raise
-        of_this_package = str(target).startswith(("clear_strategies.", "rasterizers."))
-        remedy = "pip install 'clear-strategies[train]'" if of_this_package else "Correct its name, or PYTHONPATH"
-        raise SettingError(f"{key}: {target} cannot be imported ({one_line(error)}). {remedy}.") from error
+    function = located(target, key)
     parameters, hints = _parameters(function), _hints(function)
     given = {name: value for name, value in node.items() if name not in _KEYWORDS}
     _refuse_unknown(given, parameters, key, str(target))
@@ -169,6 +159,21 @@ def _called(node: Mapping[str, Any], key: str) -> Any:
         raise
     except (ValueError, BackendUnavailable) as error:
         raise SettingError(_with_key(one_line(error), key, parameters)) from error
+
+
+def located(target: Any, key: str) -> Callable[..., Any]:
+    """The class or function of a dotted name; a SettingError, which begins with the key, where it cannot be imported."""
+    try:
+        return _located(target)
+    except Exception as error:  # whatever a module does when it is imported
+        if place := _place_in_module(error):
+            cause = f"{place}: {type(error).__name__}: {one_line(error)}"
+            raise SettingError(f"{key}: {target} cannot be imported: {cause}. Correct that file.") from error
+        if not isinstance(error, ImportError | AttributeError):
+            raise
+        of_this_package = str(target).startswith(("clear_strategies.", "rasterizers."))
+        remedy = "pip install 'clear-strategies[train]'" if of_this_package else "Correct its name, or PYTHONPATH"
+        raise SettingError(f"{key}: {target} cannot be imported ({one_line(error)}). {remedy}.") from error
 
 
 def _place_in_module(error: Exception) -> str:

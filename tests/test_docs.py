@@ -22,7 +22,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from PIL import Image
 
-from clear_strategies import Conductor, Objective, Photo, options
+from clear_strategies import Conductor, Objective, Photo
 from clear_strategies.commands import train
 from clear_strategies.files import write_text
 from clear_strategies.options import CONF
@@ -188,18 +188,19 @@ def test_the_guides_loss_and_densifier_train_as_they_say(run_block):
     assert ((gains != 1) & ((gains - 1).abs() < 0.1)).all()
 
 
-def test_the_guides_reader_reads_a_folder_and_is_chosen_for_it(tmp_path, monkeypatch):
+def test_the_guides_reader_reads_a_folder_and_train_chooses_it_in_a_folder_of_options(tmp_path, monkeypatch):
     (block,) = blocks(DOCS / "how-to" / "own-reader.md", "python")
     (tmp_path / "your_package.py").write_text(block)
     (option,) = blocks(DOCS / "how-to" / "own-reader.md", "yaml")
     write_text(tmp_path / "conf" / "data" / "mine.yaml", option)
-    monkeypatch.setattr(options, "CONF", tmp_path / "conf")
     monkeypatch.syspath_prepend(tmp_path)
     for i in range(3):
         Image.new("RGB", (24, 16), (80 * i, 0, 0)).save(tmp_path / f"{i}.png")
     rows = "".join(f"{i}.png,24,16,30,30,{i},0,-2\n" for i in range(3))
     (tmp_path / "poses.csv").write_text(f"file,width,height,fx,fy,x,y,z\n{rows}")
-    assert train.detect(tmp_path) == "mine"
+    for flags in (["--config-dir", "conf"], ["--config-dir=elsewhere", "-cd=conf"]):
+        monkeypatch.chdir(tmp_path)
+        assert "data=mine" in train.overrides([".", "fit.seed=1", *flags])
     capture = importlib.import_module("your_package").read(tmp_path)
     assert [frame.name for frame in capture.frames] == ["0.png", "1.png", "2.png"]
     assert capture.frames[2].camera.center.tolist() == [2, 0, -2]

@@ -34,7 +34,8 @@ The command trains +strategy=best on all photos for fit.iterations={_ITERATIONS}
 """
 # Beginnings of arguments that choose the strategies, and the number of iterations; each replaces the command's default.
 CHOOSE_STRATEGIES: Final = ("+strategy=", "+method=", "experiment=", "+experiment=")
-_BEFORE_FOLDERS: Final = ("--config-dir", "-cd", "--config-path", "-cp")  # flags of Hydra
+_CONFIG_DIR: Final = ("--config-dir", "-cd")  # Hydra's flag for a folder of options of one's own
+_BEFORE_FOLDERS: Final = (*_CONFIG_DIR, "--config-path", "-cp")
 _CHOOSE_ITERATIONS: Final = ("fit.iterations=", "experiment=", "+experiment=", "+protocol=", "+scene=")
 
 
@@ -78,7 +79,7 @@ def overrides(arguments: Sequence[str]) -> list[str]:
     from clear_strategies.compose import quoted
     from clear_strategies.jobs.resume import begun
 
-    kind = detect(path)
+    kind = detect(path, *_folders_of_options(rest))
     if kind == "photos" and begun(path):
         remedy = f"view {shlex.quote(str(path))} shows it; the command that began it, with fit.resume={path}, goes on"
         raise SettingError(f"train: {path} is the folder of a run, not of photos. clear-strategies {remedy}.")
@@ -87,14 +88,27 @@ def overrides(arguments: Sequence[str]) -> list[str]:
     return [*used, f"data={kind}", f"data.path={quoted(str(path))}", *rest]
 
 
-def detect(path: Path) -> str:
-    """Choose the option of conf/data for a path, by the highest rank of the readers: the value of `recognises` in the reader's
-    module, 0 if it cannot read the path. A folder may contain several formats, as LLFF's contain a COLMAP model.
+def _folders_of_options(arguments: Sequence[str]) -> list[Path]:
+    """The folder that `--config-dir` names, if it is there; of several Hydra takes the last."""
+    words = [f"{before}={word}" if before in _CONFIG_DIR else word for before, word in pairwise(["", *arguments])]
+    named = [folder for flag, _, folder in (word.partition("=") for word in words) if flag in _CONFIG_DIR and folder]
+    return [folder for folder in map(path_of, named[-1:]) if folder.is_dir()]
+
+
+def detect(path: Path, *own: Path) -> str:
+    """Choose the option of the group `data` for a path, by the highest rank of the readers: the value of `recognises` in the
+    reader's module, 0 if it cannot read the path. A folder may contain several formats, as LLFF's contain a COLMAP model.
+
+    Args:
+        own: folders of options besides conf/ and those of other packages.
     """
     from clear_strategies.options import options
+    from clear_strategies.settings import TARGET, located
 
     ranks = {}
-    for name, node in options("data").items():
-        module = import_module(node.get("reader", {}).get("_target_", __name__).rpartition(".")[0])
-        ranks[name] = module.recognises(path) if hasattr(module, "recognises") else 0
+    for name, node in options("data", *own).items():
+        if target := (node.get("reader") or {}).get(TARGET):
+            located(target, f"data={name}: reader")
+            module = import_module(target.rpartition(".")[0])
+            ranks[name] = module.recognises(path) if hasattr(module, "recognises") else 0
     return max(sorted(ranks), key=lambda name: ranks[name])

@@ -8,6 +8,7 @@ from clear_strategies import commands, hydra_app
 from clear_strategies.commands import train
 from clear_strategies.compose import composed, tree
 from clear_strategies.errors import SettingError
+from clear_strategies.files import write_text
 from clear_strategies.notebook import Run
 from tests.helpers.finished_run import make_run
 
@@ -54,6 +55,36 @@ def test_a_folder_of_options_is_no_second_folder_of_photos(tmp_path, monkeypatch
     assert train.overrides(["photos", flag, "mine", "fit.seed=1"])[-3:] == [flag, "mine", "fit.seed=1"]
     with pytest.raises(SettingError, match="mine is a second folder"):
         train.overrides(["photos", "mine"])
+
+
+@pytest.mark.parametrize(
+    ("module", "cause"),
+    [
+        (None, r"\(No module named 'absent_reader'\)\. Correct its name, or PYTHONPATH\."),
+        ("1 / 0", r": .*absent_reader\.py:1: ZeroDivisionError: division by zero\. Correct that file\."),
+    ],
+)
+def test_a_reader_of_a_folder_of_options_that_cannot_be_imported_is_named(tmp_path, monkeypatch, module, cause):
+    monkeypatch.chdir(tmp_path)
+    write_text(tmp_path / "mine" / "data" / "odd.yaml", "reader: {_target_: absent_reader.read}")
+    write_text(tmp_path / "mine" / "data" / "none.yaml", "reader: null")
+    if module:
+        write_text(tmp_path / "modules" / "absent_reader.py", module)
+        monkeypatch.syspath_prepend(tmp_path / "modules")
+    with pytest.raises(SettingError, match=rf"^data=odd: reader: absent_reader\.read cannot be imported ?{cause}$"):
+        train.overrides([".", "--config-dir", "mine"])
+
+
+def test_a_file_of_options_that_is_malformed_is_named_with_its_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "mine" / "data" / "odd.yaml"
+    write_text(file, "reader:\n  a: [\n")
+    for command in (lambda flag: train.overrides([".", flag]), lambda flag: hydra_app.main([flag, "data=odd"])):
+        with pytest.raises(SettingError, match=r"is no valid YAML: .*odd\.yaml\", line 3.* Correct that line\."):
+            command("--config-dir=mine")
+    write_text(file, "- a\n")
+    with pytest.raises(SettingError, match=r"odd\.yaml: .* has lines as `name: value`, got \['a'\]\. Correct it\."):
+        train.overrides([".", "--config-dir=mine"])
 
 
 @pytest.mark.parametrize("hidden", ["config.yaml", "strategy/gco.yaml"])  # the first: that of RUN/.hydra
